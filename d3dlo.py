@@ -1,0 +1,802 @@
+"""D3DLO: Deep 3D LiDAR Odometry (Adis, Horst, Wien; ICIP 2021). The whole method in this file, in the paper's order.
+
+Two LiDAR scans in, the motion between them out: set abstraction on each scan, a flow embedding between them, two more set
+abstractions, a mini-PointNet, an MLP; 61,290 parameters. Geometry is computed once, in NumPy, from coordinates alone
+(sampling and grouping depend on no weight); only what is learned is torch.
+
+Frame: Velodyne, x forward, y left, z up, metres. `T_ab` maps points of frame b into frame a. A motion is T_{t,t+1} (eq. 1), as
+a vector [tx, ty, tz] in metres and [roll, pitch, yaw] in degrees. Shapes: N points of a scan, S centroids, k neighbours of each,
+B pairs of scans, C clouds (scans) in a batch, D features.
+
+    python d3dlo.py train                       # simulated city, 15 minutes on two CPU cores
+    python d3dlo.py train --data ROOT           # KITTI odometry, the paper's schedule
+    python d3dlo.py eval --data ROOT            # with the weights beside this file
+"""
+import argparse
+import ctypes
+import hashlib
+import json
+import math
+import multiprocessing
+import os
+import platform
+import signal
+import sys
+import time
+import warnings
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+import torch
+import torch.nn.functional as F
+from scipy.spatial import cKDTree
+from torch import nn
+
+import kitti
+import metrics
+from kitti import SPLITS, from_vector, invert, progress, to_vector
+
+WEIGHTS = Path(__file__).with_name("d3dlo.pt")      # the weights shipped
+MAX_RANGE = 100.0                                   # m; KITTI ends at 81 m, and one stray return must not become a centroid
+
+
+# ---------------------------------------------------------------------------------------------------- Table 1 and the choices
+
+class Layer(NamedTuple):
+    """A row of Table 1."""
+    r: float | None         # radius of the ball [m]
+    n_fps: int | None       # centroids kept by farthest point sampling
+    n_n: int | None         # neighbours of a centroid
+    mlp: tuple              # output widths of the MLP
+
+
+@dataclass(frozen=True)
+class Config:
+    """Table 1, and the choices the paper describes or leaves open. The defaults are the paper's training on KITTI."""
+    #                   r    n_fps  n_n   MLP
+    sa1: Layer = Layer(1.0,  1024,    8, (4, 8, 16, 32))
+    fe: Layer = Layer(None,  None,   16, (32, 64))
+    sa2: Layer = Layer(4.0,   256,   32, (64, 64))
+    sa3: Layer = Layer(8.0,    64,    8, (64, 64))
+    mpn: Layer = Layer(None, None, None, (64, 256))
+    mlp: Layer = Layer(None, None, None, (64, 6))
+
+    epochs: int = 500           # section 4
+    batch: int = 16             # pairs; not in the paper
+    lr: float = 1e-3            # Adam's default; the peak of the one-cycle schedule
+    schedule: str = "steps"     # "steps": x0.1 at 3/5 and 4/5 of the epochs, 300 and 400 of 500; "one-cycle": annealed to nothing
+    swap: str = "both"          # "both" directions of every pair in a batch, or at "random" one of them (section 4)
+    augment: bool = False       # mirror pairs and move Q by small random motions: not in the paper
+
+    def __post_init__(self):
+        for name in ("sa1", "fe", "sa2", "sa3", "mpn", "mlp"):     # json turns tuples into lists; turn them back
+            r, n_fps, n_n, mlp = getattr(self, name)
+            object.__setattr__(self, name, Layer(r, n_fps, n_n, tuple(mlp)))
+
+
+SHORT = dict(epochs=14, lr=4e-3, schedule="one-cycle", augment=True)     # the 15-minute training on the simulated city
+
+
+# ------------------------------------------------------------------------ section 3.3.2, 3.3.3: sampling and grouping (NumPy)
+
+def farthest_point_sampling(xyz, n, start=0, tree=None):
+    """Exact farthest point sampling: (N,3) -> (n,) int64 indices. Each pick is the point farthest from all picks before it.
+
+    Ties go to the lowest index. Nested: the first m picks are what n = m gives. `tree`, a cKDTree of xyz, saves building one:
+    the order of its leaves cuts the cloud into runs of neighbours, and a pick can only bring nearer the points of runs whose
+    bounding box is nearer to it than the run's farthest point is to the picks so far. All other runs are left alone.
+    ValueError when there are fewer than n points.
+    """
+    if not 0 < n <= len(xyz):
+        raise ValueError(f"farthest point sampling of {n} among {len(xyz)} points: n must be 1 to {len(xyz)}")
+    order = (tree or cKDTree(xyz)).indices
+    order = np.pad(order, (0, -len(order) % 192), mode="edge").reshape(-1, 192)                # (runs,192), the last one padded
+    x, y, z = np.ascontiguousarray(xyz[order].transpose(2, 0, 1))                              # each (runs,192)
+    low, high = (np.stack([f(c, axis=1) for c in (x, y, z)]) for f in (np.min, np.max))        # (3,runs) boxes
+    nearest = np.full(order.shape, np.inf, x.dtype)         # squared distance of each point to the picks so far
+    farthest = nearest[:, 0].copy()                         # the largest of each run
+    picks = np.empty(n, np.int64)
+    picks[0] = start
+    for i in range(1, n):
+        p = xyz[picks[i - 1]][:, None]
+        gap = np.maximum(np.maximum(low - p, p - high), 0)  # (3,runs) from the pick to the box
+        gap *= gap
+        runs = np.flatnonzero((gap[0] + gap[1]) + gap[2] < farthest)
+        d = x[runs]; d -= p[0]; d *= d                      # the sum in the same order as the box's, so that rounding agrees
+        e = y[runs]; e -= p[1]; e *= e; d += e
+        e = z[runs]; e -= p[2]; e *= e; d += e
+        np.minimum(d, nearest[runs], out=d)
+        nearest[runs] = d
+        farthest[runs] = d.max(1)
+        best = farthest.max()
+        runs = np.flatnonzero(farthest == best)
+        picks[i] = order[runs][nearest[runs] == best].min()
+    return picks
+
+
+def group_ball(xyz, centroids, r, n_n, tree=None):
+    """The ball of eq. 3: (N,3) points, (S,) indices of the centroids among them -> (S,n_n) indices.
+
+    The nearest n_n points within r metres, r included, the centroid itself among them; where there are fewer, the missing slots
+    hold the centroid's own index (section 3.3.2), which changes no maximum.
+    """
+    _, idx = (tree or cKDTree(xyz)).query(xyz[centroids], [*range(1, n_n + 1)], distance_upper_bound=np.nextafter(r, np.inf))
+    return np.where(idx == len(xyz), centroids[:, None], idx)                                  # scipy marks a missing one by N
+
+
+def group_knn(query, xyz, k):
+    """The neighbours of the flow embedding (section 3.3.3): (S,3), (N,3) -> (S,k) indices of the k points nearest to each query
+    point; with fewer than k points the nearest is repeated."""
+    _, idx = cKDTree(xyz).query(query, [*range(1, k + 1)])
+    return np.where(idx == len(xyz), idx[:, :1], idx)
+
+
+def geometry_dtype(config):
+    """The record of one scan, all that the network needs of it."""
+    (_, n1, k1, _), (_, n2, k2, _), (_, n3, k3, _) = config.sa1, config.sa2, config.sa3
+    return np.dtype([("xyz", "f4", (n1, 3)),            # centroids of SA1, of which the first n2 and n3 are those of SA2 and SA3
+                     ("group", "f4", (n1, k1, 4)),      # their neighbours: offset [m] and intensity
+                     ("idx2", "u2", (n2, k2)),          # neighbours in SA2, of SA1's centroids
+                     ("idx3", "u2", (n3, k3)),          # neighbours in SA3, of SA2's
+                     ("dropped", "i4")])                # NaN or infinite points left out
+
+
+def scan_geometry(scan, config=Config()):
+    """Sampling and grouping of all three set abstractions: scan (N,4) -> record of `geometry_dtype`. FPS is nested, so one
+    sampling serves them all. Points that are not finite or beyond MAX_RANGE are left out; ValueError when too few remain."""
+    scan = np.asarray(scan)
+    if scan.ndim != 2 or scan.shape[1] != 4:
+        raise ValueError(f"a scan has the shape (N, 4): x, y, z [m] and intensity, not {scan.shape}")
+    finite = np.isfinite(scan).all(1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        scan = np.ascontiguousarray(scan[finite & (np.square(scan[:, :3]).sum(1) < MAX_RANGE ** 2)], np.float32)
+    (r1, n1, k1, _), (r2, n2, k2, _), (r3, n3, k3, _) = config.sa1, config.sa2, config.sa3
+    if len(scan) < n1:
+        raise ValueError(f"{len(scan)} usable points (finite, nearer than {MAX_RANGE:.0f} m), at least {n1} are needed")
+    cloud = np.ascontiguousarray(scan[:, :3])
+    tree = cKDTree(cloud)
+    centroids = farthest_point_sampling(cloud, n1, tree=tree)
+    out = np.empty((), geometry_dtype(config))
+    out["xyz"] = xyz = cloud[centroids]                                                        # (n1,3)
+    group = scan[group_ball(cloud, centroids, r1, k1, tree)]                                   # (n1,k1,4)
+    group[..., :3] -= xyz[:, None]
+    out["group"] = group
+    out["idx2"] = group_ball(xyz, np.arange(n2), r2, k2)
+    out["idx3"] = group_ball(xyz[:n2], np.arange(n3), r3, k3)
+    out["dropped"] = (~finite).sum()
+    return out
+
+
+def fingerprint(sequence):
+    """16 hex digits that tell a sequence's data from others', wherever they lie: sizes of all scans, first and last scan, poses."""
+    digest = hashlib.sha256(np.array([path.stat().st_size for path in sequence.scan_paths]).tobytes())
+    for path in (sequence.scan_paths[0], sequence.scan_paths[-1]):
+        digest.update(path.read_bytes())
+    digest.update(b"" if sequence.poses_cam is None else sequence.poses_cam.tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _geometry_of_file(path, config):
+    try:
+        return scan_geometry(kitti.read_scan(path), config)
+    except ValueError as error:
+        raise ValueError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
+
+
+def load_geometry(sequences, config, cache="cache"):
+    """List of `Sequence` -> list of (n,) arrays of records, memory-mapped from files that are made where there are none yet.
+
+    The name of a file holds all it depends on, so a stale one is never read; it is moved into place when complete, so that two
+    runs may share a cache. Any core works on one scan at a time. ValueError for a scan with too few points.
+    """
+    dtype = geometry_dtype(config)
+    files = []
+    for s in sequences:
+        depends = (fingerprint(s), [p.stat().st_mtime_ns for p in s.scan_paths], dtype.descr, config.sa1.r, config.sa2.r,
+                   config.sa3.r, MAX_RANGE)
+        files.append(Path(cache) / f"{s.name}-{hashlib.sha256(repr(depends).encode()).hexdigest()[:16]}.npy")
+    missing = [(s, file) for s, file in zip(sequences, files) if not file.is_file()]
+    if missing:
+        paths = [path for s, _ in missing for path in s.scan_paths]
+        with multiprocessing.Pool(os.cpu_count(), signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
+            records = pool.imap(partial(_geometry_of_file, config=config), paths, chunksize=4)
+            records = progress(records, len(paths), "sampling and grouping, scans")
+            for s, file in missing:
+                with metrics.replacing(file) as temporary:
+                    out = np.lib.format.open_memmap(temporary, "w+", dtype, (len(s),))
+                    for i in range(len(s)):
+                        out[i] = next(records)
+                    out.flush()
+    geometry = [np.load(file, mmap_mode="r") for file in files]
+    for s, records in zip(sequences, geometry):
+        if records["dropped"].any():
+            print(f"sequence {s.name}: left out {records['dropped'].sum()} NaN or infinite points in "
+                  f"{np.count_nonzero(records['dropped'])} of {len(s)} scans", file=sys.stderr)
+    return geometry
+
+
+class Batch(NamedTuple):
+    """C clouds and B pairs (p, q) of them, as tensors."""
+    xyz: torch.Tensor       # (C,n1,3)
+    group: torch.Tensor     # (C,n1,k1,4)
+    idx2: torch.Tensor      # (C,n2,k2)
+    idx3: torch.Tensor      # (C,n3,k3)
+    p: torch.Tensor         # (B,) the cloud that is P
+    q: torch.Tensor         # (B,) the cloud that is Q
+    idx_fe: torch.Tensor    # (B,n1,k) neighbours in Q of each centroid of P
+
+
+def make_batch(clouds, p, q, config, device="cpu"):
+    """(C,) records, (B,) and (B,) indices of them -> Batch on `device`. The one thing computed here is what depends on a pair."""
+    idx_fe = np.stack([group_knn(clouds["xyz"][i], clouds["xyz"][j], config.fe.n_n) for i, j in zip(p, q)])
+    arrays = (clouds["xyz"], clouds["group"], clouds["idx2"].astype(np.int64), clouds["idx3"].astype(np.int64), p, q, idx_fe)
+    return Batch(*(torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in arrays))
+
+
+# --------------------------------------------------------------------------------------------- section 3.3: the network (torch)
+
+class GatherAdd(torch.autograd.Function):
+    """u (B,n,D), v (B,S,D), idx (B,S,k) -> z_ij = u_{idx_ij} + v_i (B,S,k,D)."""
+
+    @staticmethod
+    def forward(ctx, u, v, idx):
+        (B, n, D), k = u.shape, idx.shape[2]
+        rows = (idx + n * torch.arange(B, device=idx.device)[:, None, None]).view(-1, 1)       # (B*S*k,1)
+        ctx.save_for_backward(rows)
+        ctx.n = n
+        return u.reshape(B * n, D).gather(0, rows.expand(-1, D)).view(B, -1, k, D).add_(v[:, :, None])
+
+    @staticmethod
+    def backward(ctx, grad):
+        rows, (B, S, k, D) = ctx.saved_tensors[0], grad.shape
+        grad_u = grad.new_zeros(B * ctx.n, D).scatter_add_(0, rows.expand(-1, D), grad.reshape(-1, D))
+        return grad_u.view(B, ctx.n, D), grad.sum(2), None
+
+
+class LinearMax(torch.autograd.Function):
+    """h (B,S,k,D), W (D',D) -> max over k of h W^T (B,S,D'), and E[h] (D,) and E[h^T h] (D,D) over all B*S*k rows.
+
+    Pair by pair, and once more on the way back, so that the largest tensors of the network, (B,S,k,D') and its gradient, never
+    exist in full: memory traffic is what a CPU waits for. Equal maxima share the gradient, as in torch.amax."""
+
+    @staticmethod
+    def forward(ctx, h, W):
+        B, S, k, D = h.shape
+        out, z = h.new_empty(B, S, len(W)), h.new_empty(S * k, len(W))
+        first, second = h.new_zeros(D), h.new_zeros(D, D)
+        for b, rows in enumerate(h.reshape(B, S * k, D)):
+            torch.mm(rows, W.t(), out=z)
+            torch.amax(z.view(S, k, -1), 1, out=out[b])
+            first += rows.sum(0)
+            second.addmm_(rows.t(), rows)
+        ctx.save_for_backward(h, W, out)
+        return out, first / (B * S * k), second / (B * S * k)
+
+    @staticmethod
+    def backward(ctx, grad, grad_first, grad_second):
+        h, W, out = ctx.saved_tensors
+        B, S, k, D = h.shape
+        grad_h, grad_W, z = torch.empty_like(h), torch.zeros_like(W), h.new_empty(S * k, len(W))
+        constant, slope = grad_first / (B * S * k), (grad_second + grad_second.t()) / (B * S * k)
+        is_max = z.view(S, k, -1)
+        for b, rows in enumerate(h.reshape(B, S * k, D)):
+            torch.mm(rows, W.t(), out=z)
+            torch.eq(is_max, out[b][:, None], out=is_max)
+            is_max.mul_((grad[b] / is_max.sum(1))[:, None])                                    # now the gradient of z
+            grad_W.addmm_(z.t(), rows)
+            torch.addmm(constant, rows, slope, out=grad_h[b].view(S * k, D)).addmm_(z, W)
+        return grad_h, grad_W
+
+
+def norm_relu(norm, z):
+    """ReLU(BN(z)) over the last axis of z (B,S,k,D). Seen as (B,D,S,k) it is channels-last, for which torch is fast."""
+    return F.relu_(norm(z.permute(0, 3, 1, 2))).permute(0, 2, 3, 1)
+
+
+def linear_norm_relu_max(linear, norm, h):
+    """max over k of ReLU(BN(linear(h))): (B,S,k,D) -> (B,S,D').
+
+    ReLU and BN are monotone in each channel, so the maximum is taken first: of z where BN's scale is positive, of -z where it is
+    negative. BN's statistics are still those of all neighbours; they follow from h's: mean = W E[h] + b, var = diag(W Cov[h] W^T).
+    """
+    sign = torch.where(norm.weight < 0, -1.0, 1.0)
+    W, b = sign[:, None] * linear.weight, sign * linear.bias
+    z, first, second = LinearMax.apply(h, W)                                                   # (B,S,D'), (D,), (D,D)
+    z = z + b
+    if norm.training:
+        n = h[..., 0].numel()
+        mean, var = W @ first + b, ((W @ (second - first[:, None] * first)) * W).sum(1).clamp(min=0)
+        with torch.no_grad():                                                                  # as torch's BatchNorm does it
+            norm.num_batches_tracked += 1
+            share = norm.momentum or 1 / norm.num_batches_tracked.item()
+            norm.running_mean.lerp_(sign * mean, share)
+            norm.running_var.lerp_(var * n / (n - 1), share)
+    else:
+        mean, var = sign * norm.running_mean, norm.running_var
+    return F.relu((z - mean) * (norm.weight.abs() * torch.rsqrt(var + norm.eps)) + norm.bias)
+
+
+class MiniPointNet(nn.Module):
+    """Section 3.3.1: an MLP shared by all points, h: R^D -> R^D', then the element-wise maximum over them. Every layer is linear,
+    batch normalisation, ReLU. It is the core of SA and FE too, which give the first linear layer's output: see there."""
+
+    def __init__(self, d_in, widths):
+        super().__init__()
+        self.linears = nn.ModuleList(nn.Linear(a, b) for a, b in zip((d_in, *widths), widths))
+        self.norms = nn.ModuleList(nn.BatchNorm2d(b) for b in widths)
+
+    def forward(self, z):
+        """First linear layer's output (B,S,k,D1) -> (B,S,D'), the maximum over k."""
+        h = norm_relu(self.norms[0], z)
+        for linear, norm in zip(self.linears[1:-1], self.norms[1:-1]):
+            h = norm_relu(norm, linear(h))
+        return linear_norm_relu_max(self.linears[-1], self.norms[-1], h)
+
+
+class SetAbstraction(nn.Module):
+    """Section 3.3.2, eq. 3: f'_j = max_i h_sa(f_i, x_i - x'_j) over the neighbours i of centroid j.
+
+    The first linear layer acts on a concatenation, so it is applied to each point before gathering, W [x_i - x'_j, f_i] + b =
+    (W_x x_i + W_f f_i) + (b - W_x x'_j): the same parameters and function at a fraction of the memory traffic.
+    """
+
+    def __init__(self, d_in, layer):
+        super().__init__()
+        self.h = MiniPointNet(3 + d_in, layer.mlp)
+
+    def forward(self, xyz, feat, idx):
+        """xyz (B,n,3), feat (B,n,D), idx (B,S,k) -> features (B,S,D') of the centroids, which are the first S points."""
+        W_x, W_f = self.h.linears[0].weight.split([3, feat.shape[2]], dim=1)
+        u = xyz @ W_x.t() + feat @ W_f.t()                                                     # (B,n,D1)
+        v = self.h.linears[0].bias - xyz[:, :idx.shape[1]] @ W_x.t()                           # (B,S,D1)
+        return self.h(GatherAdd.apply(u, v, idx))
+
+    def forward_grouped(self, group):
+        """The same for SA1, whose neighbours come gathered: (C,S,k,3+c) offsets and intensities -> (C,S,D')."""
+        return self.h(self.h.linears[0](group))
+
+
+class FlowEmbedding(nn.Module):
+    """Section 3.3.3, eq. 4: e_i = max_j h_fe(f_i, g_j, y_j - x_i) over the neighbours j in Q of point i of P. The first linear
+    layer is split as in SetAbstraction."""
+
+    def __init__(self, d_in, layer):
+        super().__init__()
+        self.h = MiniPointNet(3 + 2 * d_in, layer.mlp)
+
+    def forward(self, xyz_p, feat_p, xyz_q, feat_q, idx):
+        """(B,S,3), (B,S,D), (B,n,3), (B,n,D), (B,S,k) -> flow embeddings (B,S,D')."""
+        W_x, W_f, W_g = self.h.linears[0].weight.split([3, feat_p.shape[2], feat_q.shape[2]], dim=1)
+        u = xyz_q @ W_x.t() + feat_q @ W_g.t()                                                 # (B,n,D1)
+        v = self.h.linears[0].bias + feat_p @ W_f.t() - xyz_p @ W_x.t()                        # (B,S,D1)
+        return self.h(GatherAdd.apply(u, v, idx))
+
+
+class D3DLO(nn.Module):
+    """The network of Fig. 1 and Table 1: SA1 on both clouds, FE between them, SA2, SA3, mini-PointNet, MLP."""
+
+    def __init__(self, config=Config()):
+        super().__init__()
+        self.config = config
+        self.sa1 = SetAbstraction(1, config.sa1)                                               # c = 1: intensity
+        self.fe = FlowEmbedding(config.sa1.mlp[-1], config.fe)
+        self.sa2 = SetAbstraction(config.fe.mlp[-1], config.sa2)
+        self.sa3 = SetAbstraction(config.sa2.mlp[-1], config.sa3)
+        self.mpn = MiniPointNet(config.sa3.mlp[-1], config.mpn.mlp)
+        hidden, out = config.mlp.mlp
+        self.mlp = nn.Sequential(nn.Linear(config.mpn.mlp[-1], hidden), nn.BatchNorm1d(hidden), nn.ReLU(), nn.Linear(hidden, out))
+
+    def forward(self, batch):
+        """Batch -> (B,6): [tx, ty, tz] m and [roll, pitch, yaw] degrees of T_pq, extrinsic x-y-z (section 3.2)."""
+        p, q, (n2, n3) = batch.p, batch.q, (batch.idx2.shape[1], batch.idx3.shape[1])
+        feat = self.sa1.forward_grouped(batch.group)                                           # (C,1024,32)
+        xyz = batch.xyz[p]                                                                     # (B,1024,3)
+        flow = self.fe(xyz, feat[p], batch.xyz[q], feat[q], batch.idx_fe)                      # (B,1024,64)
+        flow = self.sa2(xyz, flow, batch.idx2[p])                                              # (B,256,64)
+        flow = self.sa3(xyz[:, :n2], flow, batch.idx3[p])                                      # (B,64,64)
+        whole = self.mpn(self.mpn.linears[0](flow)[:, None])[:, 0]                             # (B,256), the maximum over all 64
+        return self.mlp(whole)                                                                 # (B,6)
+
+
+def load_weights(path=None, device="cpu"):
+    """Weights file or run folder (None: those beside this file) -> (D3DLO in eval mode, what else the file says as a dict).
+    The network is rebuilt from the file itself. FileNotFoundError, ValueError."""
+    path = Path(path or WEIGHTS)
+    path = path / "weights.pt" if path.is_dir() else path
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such weights; `python d3dlo.py train` makes some, --weights names them")
+    try:
+        state = torch.load(path, map_location=device, weights_only=True)
+        net = D3DLO(Config(**state["config"])).to(device).eval()
+    except Exception as error:      # torch and pickle raise many kinds; to the user they are one
+        raise ValueError(f"{path}: not D3DLO weights ({type(error).__name__}); give a weights.pt or a run folder") from None
+    try:
+        net.load_state_dict(state["model"])
+    except (RuntimeError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: its weights do not fit the network it describes ({str(error).splitlines()[-1].strip()})") from None
+    return net, state
+
+
+# --------------------------------------------------------------------------------------------------------- odometry, eq. 1
+
+@torch.inference_mode()
+def predict_motions(net, records, device="cpu", batch=16):
+    """(n,) records of consecutive scans -> (n-1,4,4) T_{t,t+1}, Velodyne frame, one forward pass a pair, SA1 once a scan."""
+    out = []
+    for i in range(0, len(records) - 1, batch):
+        clouds = records[i:i + batch + 1]
+        p = np.arange(len(clouds) - 1)
+        out.append(net(make_batch(clouds, p, p + 1, net.config, device)).cpu().numpy())
+    return from_vector(np.concatenate([np.empty((0, 6)), *out]))
+
+
+def accumulate(motions):
+    """Eq. 1: (n-1,4,4) T_{t,t+1} -> (n,4,4) T_{0,t}, the first the identity."""
+    poses = [np.eye(4)]
+    for T in motions:
+        poses.append(poses[-1] @ T)
+    return np.stack(poses)
+
+
+class Odometry:
+    """Poses from scans, one at a time: `Odometry().register(scan)`. `weights`: a file or a run folder, None for those shipped."""
+
+    def __init__(self, weights=None, device="cpu"):
+        self.net, _ = load_weights(weights, device)
+        self.device, self.pose, self.last = device, np.eye(4), None
+
+    def register(self, scan):
+        """(N,4) float32 x, y, z [m], intensity 0..1 -> pose (4,4) float64 T_{0,t} of this scan in the first one's Velodyne frame,
+        the identity for the first. The motion depends on the last two scans alone. NaN or infinite points are left out with a
+        warning; ValueError for a scan that is refused, which changes nothing."""
+        record = scan_geometry(scan, self.net.config)
+        if record["dropped"]:
+            warnings.warn(f"left out {record['dropped']} NaN or infinite points", stacklevel=2)
+        if self.last is not None:
+            self.pose = self.pose @ predict_motions(self.net, np.stack([self.last, record]), self.device)[0]
+        self.last = record
+        return self.pose.copy()
+
+
+def relative_pose(scan_p, scan_q, weights=None):
+    """Two scans (N,4) -> T_pq (4,4) float64, which maps points of Q into P's frame (section 3.1). As in `Odometry`."""
+    odometry = Odometry(weights)
+    odometry.register(scan_p)
+    return odometry.register(scan_q)
+
+
+# --------------------------------------------------------------------------------------------------------- section 4: training
+
+def augment(clouds, T_pq, rng):
+    """Cheap variety that changes no sampling and no ball, not in the paper: mirror half of the pairs left and right, and move Q
+    by a small random motion A, so that q' = A q and T_pq' = T_pq A^-1. (2n,) records, the Ps and then the Qs, changed in
+    place; (n,4,4) -> (n,4,4)."""
+    n = len(T_pq)
+    mirrored = rng.random(n) < 0.5
+    sign = np.where(np.tile(mirrored, 2), -1, 1).astype(np.float32)
+    clouds["xyz"][..., 1] *= sign[:, None]
+    clouds["group"][..., 1] *= sign[:, None, None]
+    M = np.where(mirrored[:, None, None], np.diag([1.0, -1, 1, 1]), np.eye(4))
+    A = from_vector(rng.normal(size=(n, 6)) * [0.4, 0.15, 0.05, 0.2, 0.2, 1.5])                # m, degrees
+    R, t = A[:, :3, :3].astype(np.float32), A[:, :3, 3].astype(np.float32)
+    clouds["xyz"][n:] = clouds["xyz"][n:] @ R.transpose(0, 2, 1) + t[:, None]
+    clouds["group"][n:, ..., :3] = clouds["group"][n:, ..., :3] @ R.transpose(0, 2, 1)[:, None]
+    return M @ T_pq @ M @ invert(A)
+
+
+def training_batch(geometry, motions, pairs, config, rng, device="cpu"):
+    """Pairs (n,2) of (sequence, scan) -> Batch and targets (B,6). One direction is (P, Q) with T, the other (Q, P) with T^-1."""
+    clouds = np.stack([geometry[s][i + d] for d in (0, 1) for s, i in pairs])                  # (2n,): all P, all Q
+    T_pq = np.stack([motions[s][i] for s, i in pairs])                                         # (n,4,4)
+    if config.augment:
+        T_pq = augment(clouds, T_pq, rng)
+    n = np.arange(len(pairs))
+    forward, p, q, T = np.ones(len(n), bool), n, n + len(n), T_pq
+    if config.swap == "both":
+        p, q, T = np.concatenate([p, q]), np.concatenate([q, p]), np.concatenate([T, invert(T)])
+    else:                                                                                      # the paper's coin
+        forward = rng.random(len(n)) < 0.5
+        p, q, T = np.where(forward, p, q), np.where(forward, q, p), np.where(forward[:, None, None], T, invert(T))
+    target = torch.from_numpy(to_vector(T).astype(np.float32)).to(device)
+    return make_batch(clouds, p, q, config, device), target
+
+
+def batches(geometry, motions, config, seed, start, stop, device="cpu"):
+    """Yields training batches number `start` to `stop`, made one ahead in a thread. Each depends on the seed and its number
+    alone, so a training goes on after an interruption as if there had been none."""
+    pairs = np.array([(s, i) for s, T in enumerate(motions) for i in range(len(T))])
+    per_epoch = steps_per_epoch(motions, config)
+
+    def make(step):
+        epoch, part = divmod(step, per_epoch)
+        order = np.random.default_rng([seed, epoch]).permutation(len(pairs))
+        chosen = np.array_split(order, per_epoch)[part]     # nearly equal parts: BatchNorm wants no small batch
+        return training_batch(geometry, motions, pairs[chosen], config, np.random.default_rng([seed, epoch, part]), device)
+
+    with ThreadPoolExecutor(1) as pool:
+        ahead = pool.submit(make, start)
+        for step in range(start, stop):
+            batch = ahead.result()
+            if step + 1 < stop:
+                ahead = pool.submit(make, step + 1)
+            yield batch
+
+
+def steps_per_epoch(motions, config):
+    return math.ceil(sum(map(len, motions)) / config.batch)
+
+
+def loss_unweighted(y_hat, y):
+    """Eq. 2: the mean absolute error over metres and degrees alike. (B,6), (B,6) -> ()."""
+    return (y - y_hat).abs().mean()
+
+
+def recompute_statistics(net, batches):
+    """BatchNorm's running averages lag behind the weights; replace them by the plain mean over these batches, weights fixed.
+    Returns the mean loss over the batches in training mode."""
+    norms = [m for m in net.modules() if isinstance(m, nn.modules.batchnorm._BatchNorm)]
+    momenta = [norm.momentum for norm in norms]
+    for norm in norms:
+        norm.reset_running_stats()
+        norm.momentum = None
+    loss = mean_loss(net.train(), batches)
+    for norm, momentum in zip(norms, momenta):
+        norm.momentum = momentum
+    return loss
+
+
+@torch.no_grad()
+def mean_loss(net, batches):
+    """Mean of eq. 2 over batches, in the mode the network is in."""
+    return float(np.mean([loss_unweighted(net(batch), target).item() for batch, target in batches]))
+
+
+def save(path, **state):
+    with metrics.replacing(path) as temporary:
+        torch.save(state, temporary)
+
+
+def fit(net, geometry, motions, run, seed, device, resume=None, say=print, **remember):
+    """Adam and the schedule of the config over all its epochs. Writes RUN/checkpoint.pt, from which `resume` (its content)
+    goes on, and RUN/weights.pt, for use: with BatchNorm statistics recomputed, and `remember` beside them."""
+    config, per_epoch = net.config, steps_per_epoch(motions, net.config)
+    total = config.epochs * per_epoch
+    optimizer = torch.optim.Adam(net.parameters(), lr=config.lr)
+    if config.schedule == "one-cycle":
+        scheduler = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.lr, total_steps=total)
+    else:
+        scheduler = torch.optim.lr_scheduler.MultiStepLR(optimizer, [total * 3 // 5, total * 4 // 5], gamma=0.1)
+    step, losses = 0, []
+    if resume:
+        for part, name in (net, "model"), (optimizer, "optimizer"), (scheduler, "scheduler"):
+            part.load_state_dict(resume[name])
+        step, losses = resume["step"], resume["losses"]
+    saved = time.monotonic()
+    todo = batches(geometry, motions, config, seed, step, total, device)
+    what = f"training, batches of {config.batch * (2 if config.swap == 'both' else 1)} pairs"
+    for batch, target in progress(todo, total - step, what):
+        loss = loss_unweighted(net.train()(batch), target)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        lr = scheduler.get_last_lr()[0]
+        scheduler.step()
+        step += 1
+        losses.append(loss.item())
+        if step % per_epoch == 0:
+            say(f"epoch {step // per_epoch}/{config.epochs}: loss {np.mean(losses):.4f} (eq. 2), learning rate {lr:.1e}")
+            losses = []
+        if step == total or time.monotonic() - saved > 300:
+            save(run / "checkpoint.pt", config=config_dict(config), model=net.state_dict(), optimizer=optimizer.state_dict(),
+                 scheduler=scheduler.state_dict(), step=step, losses=losses, **remember)
+            usable = D3DLO(config).to(device)
+            usable.load_state_dict(net.state_dict())
+            recompute = list(batches(geometry, motions, config, [seed, 1], 0, min(25, total), device))
+            loss_train = recompute_statistics(usable, recompute)
+            save(run / "weights.pt", config=config_dict(config), model=usable.state_dict(), step=step, **remember)
+            saved = time.monotonic()
+    loss_eval = mean_loss(usable.eval(), recompute)
+    say(f"loss over {len(recompute)} training batches: {loss_train:.4f} in train mode, {loss_eval:.4f} in eval mode")
+    return usable
+
+
+def config_dict(config):
+    return json.loads(json.dumps(asdict(config)))       # plain lists, which torch.load takes back with weights_only=True
+
+
+# ----------------------------------------------------------------------------------------------- sections 5 and 6: evaluation
+
+def evaluate(net, sequences, geometry, out, state, device="cpu"):
+    """Runs the network over sequences, writes OUT/NN.txt (KITTI pose files) and OUT/results.json, and returns (results, table).
+
+    Beside the network stand two trivial predictors: standing still, and the mean motion of the training set.
+    """
+    trained_on = state.get("train", {})
+    predictors = {"D3DLO": {}, "standing still": {}, "mean motion of the training set": {}}
+    constant = {"standing still": np.eye(4), "mean motion of the training set": from_vector(state["mean_motion"])}
+    for s, records in progress(zip(sequences, geometry), len(sequences), "registering, sequences"):
+        motions = predict_motions(net, records, device)
+        metrics.write_poses(out / f"{s.name}.txt", kitti.velo_to_camera(accumulate(motions), s.Tr))
+        if s.poses is not None:
+            for name, scores in predictors.items():
+                poses = accumulate(motions if name == "D3DLO" else np.broadcast_to(constant[name], motions.shape))
+                scores[s.name] = (metrics.segment_errors(s.poses_cam, kitti.velo_to_camera(poses, s.Tr)),
+                                  metrics.step_errors(s.poses, poses))
+    known = {s.name: trained_on.get(s.name) == fingerprint(s) for s in sequences}
+
+    def score(names, predictor="D3DLO"):
+        scores = [predictors[predictor][name] for name in names]
+        return metrics.summary([s for s, _ in scores], [s for _, s in scores]) | {"trained_on": any(known[n] for n in names)}
+
+    truth = list(predictors["D3DLO"])
+    splits = {split: [n for n in names if n in truth] for split, names in SPLITS.items()}
+    groups = {split: names for split, names in splits.items() if names} | {"all": truth}
+    results = {"sequences": {s.name: score([s.name] if s.name in truth else []) for s in sequences},
+               "splits": {split: score(names) for split, names in groups.items() if split != "all"}, "pooled": score(truth),
+               "predictors": {p: {group: score(names, p) for group, names in groups.items()} for p in constant}}
+    rows = [metrics.row(name + " *" * known[name], results["sequences"][name]) for name in results["sequences"]]
+    for group, names in groups.items():
+        rows.append(metrics.row(group + " *" * any(known[n] for n in names), score(names)))
+        rows += [metrics.row(f"  {p}", score(names, p)) for p in constant]
+    return results, metrics.table(metrics.HEADER, rows)
+
+
+def report(net, state, sequences, geometry, out, weights, data, device):
+    """`evaluate`, then write OUT/results.json; returns the lines to print: table, units, where things lie."""
+    out.mkdir(parents=True, exist_ok=True)
+    results, table = evaluate(net, sequences, geometry, out, state, device)
+    results = {"weights": str(weights), "data": str(data), **results}
+    with metrics.replacing(out / "results.json") as temporary:
+        temporary.write_text(json.dumps(results, indent=1, default=float).replace("NaN", "null") + "\n")
+    return (f"{table}\n* trained on. E_t, E_r: KITTI's segments of 100..800 m, rectified left camera frame. t step, r step: mean length and "
+            f"angle\n  of inv(T_est) @ T_true of a step, Velodyne frame. -: no segment of 100 m, or no ground truth.\n"
+            f"trajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)\nfigures       {out}/results.json")
+
+
+# ------------------------------------------------------------------------------------------------------------- command line
+
+SIMULATED = Path("data/simulated")      # made under the current folder when no --data is given
+
+
+def train(data=None, sequences=None, out=None, epochs=None, batch=None, seed=0, device="cpu", short=False, resume=False):
+    """Train on `sequences` of `data` (None: the simulated city), evaluate on what there is of the test and validation splits.
+    Returns the run folder. See `python d3dlo.py train --help`. ValueError, FileNotFoundError."""
+    run = Path(out or time.strftime("runs/%Y-%m-%d-%H%M%S"))
+    if (run / "checkpoint.pt").exists() and not resume:
+        raise ValueError(f"{run}: holds a training already; add --resume to go on with it, or choose another --out")
+    changes = {"epochs": epochs, "batch": batch}
+    config = replace(Config(**(SHORT if short or not data else {})), **{k: v for k, v in changes.items() if v})
+    root = Path(data) if data else kitti.simulate(SIMULATED)
+    there = [s.name for s in kitti.open_sequences(root)]
+    chosen = kitti.open_sequences(root, sequences or ("train" if set(SPLITS["train"]) & set(there) else "all"))
+    for s in chosen:
+        if s.poses is None:
+            raise ValueError(f"{root}/poses/{s.name}.txt: no such file; training on sequence {s.name} needs its ground truth")
+    names = [s.name for s in chosen]
+    held_out = kitti.open_sequences(root, [n for n in SPLITS["test"] + SPLITS["validation"] if n in there and n not in names])
+    state = resume_from(run, chosen) if resume else None
+
+    run.mkdir(parents=True, exist_ok=True)
+    arguments = dict(data=data, sequences=names, epochs=epochs, batch=batch, seed=seed, device=device, short=short)
+    versions = {"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__, "torch": torch.__version__}
+    with metrics.replacing(run / "config.json") as temporary:
+        temporary.write_text(json.dumps(dict(arguments=arguments, config=asdict(config), versions=versions), indent=1) + "\n")
+
+    def say(line):
+        print(line, flush=True)
+        with open(run / "log.txt", "a", encoding="utf-8") as log:
+            log.write(line + "\n")
+
+    geometry = load_geometry(chosen + held_out, config)
+    motions = [s.motions() for s in chosen]
+    torch.manual_seed(seed)
+    net = D3DLO(config).to(device)
+    say(f"{sum(p.numel() for p in net.parameters()):,} parameters, {sum(map(len, motions)):,} pairs of scans, {config.epochs} epochs of "
+        f"{steps_per_epoch(motions, config)} batches -> {run}")
+    remember = {"train": {s.name: fingerprint(s) for s in chosen}, "mean_motion": to_vector(np.concatenate(motions)).mean(0).tolist()}
+    net = fit(net, geometry[:len(chosen)], motions, run, seed, device, state, say, **remember)
+    if held_out:
+        say(report(net, remember, held_out, geometry[len(chosen):], run / "results", run / "weights.pt", root, device))
+    say(f"weights       {run}/weights.pt\nnext          python d3dlo.py eval --weights {run}" + (f" --data {data}" if data else ""))
+    return run
+
+
+def resume_from(run, sequences):
+    try:
+        state = torch.load(run / "checkpoint.pt", weights_only=True)
+        trained = state["train"]
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{run}/checkpoint.pt: no such file, nothing to resume") from None
+    except Exception as error:
+        raise ValueError(f"{run}/checkpoint.pt: not a checkpoint ({type(error).__name__})") from None
+    if trained != {s.name: fingerprint(s) for s in sequences}:
+        raise ValueError(f"{run}: was trained on other data than it finds now; resume with the data unchanged")
+    return state
+
+
+def evaluate_command(data=None, weights=None, sequences=None, out=None, device="cpu"):
+    """The command `eval`: prints the table of `weights` (None: shipped) on `sequences` of `data` (None: the simulated test and
+    validation sequences) and returns the folder with its results. ValueError, FileNotFoundError."""
+    net, state = load_weights(weights, device)
+    out = Path(out or time.strftime("results/%Y-%m-%d-%H%M%S"))
+    root = Path(data) if data else kitti.simulate(SIMULATED, sequences=SPLITS["test"] + SPLITS["validation"])
+    chosen = kitti.open_sequences(root, sequences or ("all" if data else ["test", "validation"]))
+    print(report(net, state, chosen, load_geometry(chosen, net.config), out, weights or WEIGHTS, root, device))
+    return out
+
+
+def keep_freed_memory():
+    """Where the C library is glibc, let it keep large freed blocks. It would hand them back to the system and page-fault them in
+    again at the next allocation, which is half the time of a training step."""
+    try:
+        libc = ctypes.CDLL(None)
+        libc.mallopt(-4, 0)             # M_MMAP_MAX: large blocks from the heap too
+        libc.mallopt(-1, 2 ** 31 - 1)   # M_TRIM_THRESHOLD: and the heap never shrinks
+    except (OSError, AttributeError, TypeError):
+        pass
+
+
+def main(argv=None):
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(prog="d3dlo", formatter_class=raw, description=__doc__.split("\n\n")[0] + "\n\n" + __doc__.split("\n\n")[-1])
+    commands = parser.add_subparsers(dest="command", required=True, metavar="train | eval")
+    t = commands.add_parser("train", formatter_class=raw, help="train, then evaluate on the test and validation splits", description=(
+        "Train D3DLO, then evaluate it on the test and validation splits.\n\n  python d3dlo.py train\n"
+        "  python d3dlo.py train --data ROOT\n  python d3dlo.py train --data ROOT --sequences 00 01 --short --epochs 20\n"
+        "  python d3dlo.py train --out RUN --resume"))
+    e = commands.add_parser("eval", formatter_class=raw, help="trajectories and KITTI's errors", description=(
+        "Run D3DLO over sequences, write their trajectories, print KITTI's errors.\n\n  python d3dlo.py eval\n"
+        "  python d3dlo.py eval --data ROOT --sequences test\n  python d3dlo.py eval --data ROOT --weights RUN --sequences 11 12"))
+    for p in (t, e):
+        p.add_argument("--data", metavar="ROOT", help="folder in KITTI odometry layout (default: a simulated city, made in data/)")
+        p.add_argument("--sequences", nargs="+", metavar="NN", help="names or splits: train, test, validation, all")
+        p.add_argument("--device", default="cpu", help="cpu, cuda or mps (default: cpu)")
+    t.add_argument("--out", metavar="RUN", help="folder of the run (default: runs/TIME)")
+    t.add_argument("--epochs", type=positive, metavar="N", help=f"default: {Config.epochs}, on the simulated city {SHORT['epochs']}")
+    t.add_argument("--batch", type=positive, metavar="N", help=f"pairs in a batch, each in both directions (default: {Config.batch})")
+    t.add_argument("--seed", type=int, default=0)
+    t.add_argument("--short", action="store_true", help="the simulated city's recipe on --data: annealed learning rate, augmentation")
+    t.add_argument("--resume", action="store_true", help="go on with the training in --out, with the options it was begun with")
+    e.add_argument("--weights", metavar="FILE|RUN", help="weights or folder of a run (default: those shipped)")
+    e.add_argument("--out", metavar="DIR", help="folder for NN.txt and results.json (default: results/TIME)")
+    args = vars(parser.parse_args(argv))
+    keep_freed_memory()
+    try:
+        if args.pop("command") == "eval":
+            evaluate_command(**args)
+        elif args["resume"]:
+            train(**begun_with(args["out"]), out=args["out"], resume=True)
+        else:
+            train(**args)
+    except KeyboardInterrupt:
+        print("\nd3dlo: interrupted", file=sys.stderr)
+        return 130
+    except (ValueError, OSError) as error:
+        print(f"d3dlo: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def begun_with(run):
+    """The arguments a run was begun with."""
+    if run is None:
+        raise ValueError("--resume needs --out RUN, the folder of the training to go on with")
+    try:
+        return json.loads((Path(run) / "config.json").read_text())["arguments"]
+    except (ValueError, KeyError, TypeError, FileNotFoundError):
+        raise ValueError(f"{run}/config.json: missing or damaged, so {run} holds no training to resume") from None
+
+
+def positive(text):
+    if int(text) < 1:
+        raise argparse.ArgumentTypeError("must be 1 or more")
+    return int(text)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,201 @@
+"""How good is a trajectory? KITTI's segment errors, errors per step, ATE and RPE. NumPy only.
+
+A trajectory is an array (n,4,4): T_0i maps points of frame i into frame 0. In KITTI's pose files, frame i is the rectified
+left camera of scan i. The numbers are those of the KITTI devkit (devkit/cpp/evaluate_odometry.cpp), in the units of its
+leaderboard: E_t in percent, E_r in degrees per metre.
+
+    python metrics.py GT EST           # two pose files, or two folders of NN.txt
+"""
+import argparse
+import os
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+LENGTHS = np.arange(100, 801, 100)      # m of path, devkit: lengths[]
+START_EVERY = 10                        # frames, devkit: step_size (one second)
+SEGMENT = np.dtype([("first", int), ("last", int), ("length", float), ("t_err", float), ("r_err", float)])
+
+
+@contextmanager
+def replacing(path):
+    """Yields a temporary path beside `path`, moved onto it when the block ends well: never a half-written file."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_poses(path):
+    """A KITTI pose file, 12 numbers a row (the top three rows of a 4x4), as (n,4,4) float64. ValueError, FileNotFoundError."""
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such pose file")
+    rows = []
+    for number, line in enumerate(path.read_bytes().splitlines(), 1):
+        if not line.strip():
+            continue
+        try:
+            row = np.array(line.split(), float)
+        except ValueError:
+            raise ValueError(f"{path}, line {number}: not a row of numbers; a KITTI pose file has 12 a row") from None
+        if len(row) != 12 or not np.isfinite(row).all():
+            raise ValueError(f"{path}, line {number}: {np.isfinite(row).sum()} finite numbers of {len(row)}, a KITTI pose has 12")
+        rows.append(row)
+    if not rows:
+        raise ValueError(f"{path}: holds no pose")
+    T = np.tile(np.eye(4), (len(rows), 1, 1))                                       # (n,4,4)
+    T[:, :3] = np.reshape(rows, (-1, 3, 4))
+    R = T[:, :3, :3]
+    rigid = (np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) < 1e-2) & (np.linalg.det(R) > 0)
+    if not rigid.all():
+        raise ValueError(f"{path}: pose {np.argmin(rigid)} (from 0) is no rigid motion: its left 3x3 block is not a rotation")
+    return T
+
+
+def write_poses(path, T):
+    """Write (n,4,4) poses as a KITTI pose file, through a temporary file."""
+    with replacing(path) as temporary:
+        np.savetxt(temporary, np.asarray(T)[:, :3].reshape(-1, 12), fmt="%.9e")
+
+
+def _same_length(T_gt, T_est):
+    T_gt, T_est = np.asarray(T_gt, float), np.asarray(T_est, float)
+    if T_gt.shape != T_est.shape:
+        raise ValueError(f"{len(T_gt)} true poses but {len(T_est)} estimated ones: both must cover the same scans")
+    return T_gt, T_est
+
+
+def _angle(R):
+    """Rotation angle of (...,3,3) in degrees. atan2 and not arccos of the trace: of two nearly equal rotations read from
+    a file of seven digits the arccos makes 0.03 deg out of rounding, as much as a good odometry errs in a step."""
+    sine = np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1)
+    return np.degrees(np.arctan2(np.linalg.norm(sine, axis=-1), np.trace(R, axis1=-2, axis2=-1) - 1))
+
+
+def path_lengths(T):
+    """Path driven until each pose (n,), in metres (devkit: trajectoryDistances)."""
+    return np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1))])
+
+
+def segment_errors(T_gt, T_est):
+    """Errors of all KITTI segments of one sequence (paper: S, |theta_ij|, eq. for E_t, E_r; devkit: calcSequenceErrors).
+
+    (n,4,4), (n,4,4) -> structured array with fields first, last (frames), length [m], t_err [%], r_err [deg/m].
+    A segment starts at every 10th frame and ends at the first frame whose path from there is strictly longer than 100, 200,
+    ... 800 m of true path; errors are divided by that nominal length. The devkit sums the path in float32, which may move
+    `last` by a frame; here it is float64. ValueError when the lengths differ.
+    """
+    T_gt, T_est = _same_length(T_gt, T_est)
+    path = path_lengths(T_gt)
+    first, length = (a.ravel() for a in np.meshgrid(np.arange(0, len(path), START_EVERY), LENGTHS, indexing="ij"))
+    last = np.searchsorted(path, path[first] + length, side="right")
+    first, last, length = (a[last < len(path)] for a in (first, last, length))
+    delta_gt = np.linalg.inv(T_gt[first]) @ T_gt[last]
+    delta_est = np.linalg.inv(T_est[first]) @ T_est[last]
+    error = np.linalg.inv(delta_est) @ delta_gt                                     # (segments,4,4)
+    cosine = (np.trace(error[:, :3, :3], axis1=1, axis2=2) - 1) / 2
+    out = np.empty(len(first), SEGMENT)
+    out["first"], out["last"], out["length"] = first, last, length
+    out["t_err"] = 100 * np.linalg.norm(error[:, :3, 3], axis=1) / length
+    out["r_err"] = np.degrees(np.arccos(np.clip(cosine, -1, 1))) / length
+    return out
+
+
+def kitti_errors(segments):
+    """List of `segment_errors`, one a sequence -> (E_t [%], E_r [deg/m]), the mean over all their segments; NaN without any."""
+    pooled = np.concatenate([np.empty(0, SEGMENT), *segments])
+    return (float(pooled["t_err"].mean()), float(pooled["r_err"].mean())) if len(pooled) else (float("nan"),) * 2
+
+
+def step_errors(T_gt, T_est):
+    """(n,4,4), (n,4,4) -> (n-1,2): length [m] and angle [deg] of inv(T_est) @ T_gt of each step, in the frame of the poses."""
+    T_gt, T_est = _same_length(T_gt, T_est)
+    motion_gt, motion_est = (np.linalg.inv(T[:-1]) @ T[1:] for T in (T_gt, T_est))
+    error = np.linalg.inv(motion_est) @ motion_gt
+    return np.stack([np.linalg.norm(error[:, :3, 3], axis=1), _angle(error[:, :3, :3])], 1)
+
+
+def absolute_errors(T_gt, T_est):
+    """(n,) distances [m] between true and estimated positions, both starting where the files say: nothing is aligned."""
+    T_gt, T_est = _same_length(T_gt, T_est)
+    return np.linalg.norm(T_gt[:, :3, 3] - T_est[:, :3, 3], axis=1)
+
+
+def rmse(errors):
+    """Root of the mean square, the figure evo prints as rmse; NaN of nothing."""
+    return float(np.sqrt(np.mean(np.square(errors)))) if len(errors) else float("nan")
+
+
+def table(header, rows):
+    """Lines of right-aligned columns, the first one left-aligned; floats that are NaN as '-'."""
+    cells = [list(header)] + [["-" if str(c).strip() == "nan" else str(c) for c in row] for row in rows]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
+    return "\n".join("  ".join(c.rjust(w) if i else c.ljust(w) for i, (c, w) in enumerate(zip(row, widths))) for row in cells)
+
+
+HEADER = ["sequence", "segments", "E_t [%]", "E_r [deg/m]", "t step [m]", "r step [deg]"]
+
+
+def summary(segments, steps):
+    """Lists of `segment_errors` and `step_errors`, one a sequence -> dict of their pooled means, NaN where there is nothing."""
+    E_t, E_r = kitti_errors(segments)
+    steps = np.concatenate([np.empty((0, 2)), *steps])
+    t, r = steps.mean(0).tolist() if len(steps) else (float("nan"),) * 2
+    return {"E_t": E_t, "E_r": E_r, "t_step_m": t, "r_step_deg": r, "segments": sum(map(len, segments))}
+
+
+def row(name, s):
+    """A `summary` as a row of a table under HEADER."""
+    return [name, s["segments"], f"{s['E_t']:.3f}", f"{s['E_r']:.5f}", f"{s['t_step_m']:.4f}", f"{s['r_step_deg']:.4f}"]
+
+
+def _pairs_of_files(gt, est):
+    if gt.is_dir() != est.is_dir():
+        raise ValueError(f"{gt} and {est}: give two pose files or two folders of NN.txt, not one of each")
+    if not gt.is_dir():
+        return {gt.stem: (gt, est)}
+    names = sorted(p.stem for p in est.glob("*.txt") if (gt / p.name).is_file())
+    if not names:
+        raise FileNotFoundError(f"{est}: holds no NN.txt that {gt} holds as well")
+    return {name: (gt / f"{name}.txt", est / f"{name}.txt") for name in names}
+
+
+def main(argv=None):
+    parser = argparse.ArgumentParser(
+        description="KITTI's odometry errors of trajectories.\n\n  python metrics.py poses/00.txt results/00.txt\n"
+        "  python metrics.py poses results", formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("gt", metavar="GT", type=Path, help="ground truth: a pose file, or a folder of NN.txt")
+    parser.add_argument("est", metavar="EST", type=Path, help="estimate: likewise")
+    args = parser.parse_args(argv)
+    rows, all_segments, all_steps = [], [], []
+    try:
+        for name, files in _pairs_of_files(args.gt, args.est).items():
+            T_gt, T_est = map(read_poses, files)
+            if len(T_gt) != len(T_est):
+                raise ValueError(f"{files[1]}: {len(T_est)} poses, but {files[0]} has {len(T_gt)}; both must cover the same scans")
+            segments, steps, ate = segment_errors(T_gt, T_est), step_errors(T_gt, T_est), rmse(absolute_errors(T_gt, T_est))
+            rows.append(row(name, summary([segments], [steps])) + [f"{ate:.3f}", f"{rmse(steps[:, 0]):.4f}", f"{rmse(steps[:, 1]):.4f}"])
+            all_segments.append(segments), all_steps.append(steps)
+    except (ValueError, OSError) as error:
+        print(f"metrics.py: {error}", file=sys.stderr)
+        return 2
+    pooled, blank = np.concatenate(all_segments), ["-"] * 3
+    if len(rows) > 1:
+        rows.append(row("all", summary(all_segments, all_steps)) + blank)
+    rows += [row(f"{m} m", summary([pooled[pooled["length"] == m]], [])) + blank for m in LENGTHS if m in pooled["length"]]
+    print(table([*HEADER, "ATE [m]", "RPE [m]", "RPE [deg]"], rows))
+    print("E_t, E_r: KITTI devkit, mean over segments of 100..800 m of path. t step, r step: mean error of a step. ATE, RPE: rmse as"
+          "\nevo_ape kitti / evo_rpe kitti print it without flags (no alignment, delta one frame; degrees with -r angle_deg)."
+          "\nAll in the frame of the files: KITTI's is the rectified left camera.")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
