@@ -42,6 +42,7 @@ import metrics
 from kitti import SPLITS, from_vector, invert, progress, to_vector
 
 WEIGHTS = Path(__file__).with_name("d3dlo.pt")      # the weights shipped
+SIMULATED = Path("data/simulated")                  # made under the current folder when no --data is given
 MAX_RANGE = 100.0                                   # m; KITTI ends at 81 m, and one stray return must not become a centroid
 
 
@@ -76,7 +77,13 @@ class Config:
     def __post_init__(self):
         for name in ("sa1", "fe", "sa2", "sa3", "mpn", "mlp"):     # json turns tuples into lists; turn them back
             r, n_fps, n_n, mlp = getattr(self, name)
+            if len(mlp) < 2:
+                raise ValueError(f"Config.{name}: its MLP has {len(mlp)} layers, at least 2 are needed")
             object.__setattr__(self, name, Layer(r, n_fps, n_n, tuple(mlp)))
+
+    def as_dict(self):
+        """Plain lists and numbers, which json and torch.load(weights_only=True) give back; Config(**d) is the inverse."""
+        return json.loads(json.dumps(asdict(self)))
 
 
 SHORT = dict(epochs=14, lr=4e-3, schedule="one-cycle", augment=True)     # the 15-minute training on the simulated city
@@ -92,8 +99,9 @@ def farthest_point_sampling(xyz, n, start=0, tree=None):
     bounding box is nearer to it than the run's farthest point is to the picks so far. All other runs are left alone.
     ValueError when there are fewer than n points.
     """
-    if not 0 < n <= len(xyz):
-        raise ValueError(f"farthest point sampling of {n} among {len(xyz)} points: n must be 1 to {len(xyz)}")
+    if not (0 < n <= len(xyz) and 0 <= start < len(xyz)):
+        raise ValueError(f"farthest point sampling of {n} among {len(xyz)} points from {start}: n must be 1 to {len(xyz)}, start below that")
+    xyz = np.asarray(xyz, np.float32 if xyz.dtype == np.float32 else np.float64)
     order = (tree or cKDTree(xyz)).indices
     order = np.pad(order, (0, -len(order) % 192), mode="edge").reshape(-1, 192)                # (runs,192), the last one padded
     x, y, z = np.ascontiguousarray(xyz[order].transpose(2, 0, 1))                              # each (runs,192)
@@ -212,6 +220,7 @@ def load_geometry(sequences, config, cache="cache"):
                     for i in range(len(s)):
                         out[i] = next(records)
                     out.flush()
+            next(records, None)                         # lets the progress line end
     geometry = [np.load(file, mmap_mode="r") for file in files]
     for s, records in zip(sequences, geometry):
         if records["dropped"].any():
@@ -287,7 +296,7 @@ class LinearMax(torch.autograd.Function):
         for b, rows in enumerate(h.reshape(B, S * k, D)):
             torch.mm(rows, W.t(), out=z)
             torch.eq(is_max, out[b][:, None], out=is_max)
-            is_max.mul_((grad[b] / is_max.sum(1))[:, None])                                    # now the gradient of z
+            is_max.mul_((grad[b] / is_max.sum(1).clamp_(min=1))[:, None])                      # now the gradient of z
             grad_W.addmm_(z.t(), rows)
             torch.addmm(constant, rows, slope, out=grad_h[b].view(S * k, D)).addmm_(z, W)
         return grad_h, grad_W
@@ -413,6 +422,7 @@ def load_weights(path=None, device="cpu"):
     try:
         state = torch.load(path, map_location=device, weights_only=True)
         net = D3DLO(Config(**state["config"])).to(device).eval()
+        state["train"], from_vector(state["mean_motion"])
     except Exception as error:      # torch and pickle raise many kinds; to the user they are one
         raise ValueError(f"{path}: not D3DLO weights ({type(error).__name__}); give a weights.pt or a run folder") from None
     try:
@@ -482,7 +492,7 @@ def augment(clouds, T_pq, rng):
     clouds["xyz"][..., 1] *= sign[:, None]
     clouds["group"][..., 1] *= sign[:, None, None]
     M = np.where(mirrored[:, None, None], np.diag([1.0, -1, 1, 1]), np.eye(4))
-    A = from_vector(rng.normal(size=(n, 6)) * [0.4, 0.15, 0.05, 0.2, 0.2, 1.5])                # m, degrees
+    A = from_vector(rng.normal(size=(n, 6)) * [0.25, 0.1, 0.03, 0.1, 0.1, 1.0])                # m, degrees
     R, t = A[:, :3, :3].astype(np.float32), A[:, :3, 3].astype(np.float32)
     clouds["xyz"][n:] = clouds["xyz"][n:] @ R.transpose(0, 2, 1) + t[:, None]
     clouds["group"][n:, ..., :3] = clouds["group"][n:, ..., :3] @ R.transpose(0, 2, 1)[:, None]
@@ -507,16 +517,16 @@ def training_batch(geometry, motions, pairs, config, rng, device="cpu"):
 
 
 def batches(geometry, motions, config, seed, start, stop, device="cpu"):
-    """Yields training batches number `start` to `stop`, made one ahead in a thread. Each depends on the seed and its number
+    """Yields training batches number `start` to `stop`, made one ahead in a thread. Each depends on `seed` (a tuple) and its number
     alone, so a training goes on after an interruption as if there had been none."""
     pairs = np.array([(s, i) for s, T in enumerate(motions) for i in range(len(T))])
     per_epoch = steps_per_epoch(motions, config)
 
     def make(step):
         epoch, part = divmod(step, per_epoch)
-        order = np.random.default_rng([seed, epoch]).permutation(len(pairs))
+        order = np.random.default_rng([*seed, epoch]).permutation(len(pairs))
         chosen = np.array_split(order, per_epoch)[part]     # nearly equal parts: BatchNorm wants no small batch
-        return training_batch(geometry, motions, pairs[chosen], config, np.random.default_rng([seed, epoch, part]), device)
+        return training_batch(geometry, motions, pairs[chosen], config, np.random.default_rng([*seed, epoch, part + 1]), device)
 
     with ThreadPoolExecutor(1) as pool:
         ahead = pool.submit(make, start)
@@ -557,13 +567,14 @@ def mean_loss(net, batches):
 
 
 def save(path, **state):
+    """A dictionary of tensors and plain values to a file, through a temporary one."""
     with metrics.replacing(path) as temporary:
         torch.save(state, temporary)
 
 
-def fit(net, geometry, motions, run, seed, device, resume=None, say=print, **remember):
-    """Adam and the schedule of the config over all its epochs. Writes RUN/checkpoint.pt, from which `resume` (its content)
-    goes on, and RUN/weights.pt, for use: with BatchNorm statistics recomputed, and `remember` beside them."""
+def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=print, **remember):
+    """Train `net` by its config: Adam, eq. 2. Every five minutes writes RUN/checkpoint.pt, whose content `resume` goes on from,
+    and RUN/weights.pt, for use: with BatchNorm's statistics recomputed. `remember` is stored in both. Returns the usable net."""
     config, per_epoch = net.config, steps_per_epoch(motions, net.config)
     total = config.epochs * per_epoch
     optimizer = torch.optim.Adam(net.parameters(), lr=config.lr)
@@ -571,163 +582,171 @@ def fit(net, geometry, motions, run, seed, device, resume=None, say=print, **rem
         scheduler = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.lr, total_steps=total)
     else:
         scheduler = torch.optim.lr_scheduler.MultiStepLR(optimizer, [total * 3 // 5, total * 4 // 5], gamma=0.1)
+    parts = {"model": net, "optimizer": optimizer, "scheduler": scheduler}
     step, losses = 0, []
     if resume:
-        for part, name in (net, "model"), (optimizer, "optimizer"), (scheduler, "scheduler"):
-            part.load_state_dict(resume[name])
         step, losses = resume["step"], resume["losses"]
-    saved = time.monotonic()
-    todo = batches(geometry, motions, config, seed, step, total, device)
-    what = f"training, batches of {config.batch * (2 if config.swap == 'both' else 1)} pairs"
-    for batch, target in progress(todo, total - step, what):
+        for name, part in parts.items():
+            part.load_state_dict(resume[name])
+    usable = D3DLO(config).to(device)
+
+    def fixed_batches():        # drawn like those of the training
+        return batches(geometry, motions, config, (seed, 1), 0, min(25, total), device)
+
+    def store():
+        save(run / "checkpoint.pt", config=config.as_dict(), step=step, losses=losses, **remember,
+             **{name: part.state_dict() for name, part in parts.items()})
+        usable.load_state_dict(net.state_dict())
+        loss = recompute_statistics(usable, fixed_batches())
+        save(run / "weights.pt", config=config.as_dict(), step=step, **remember, model=usable.state_dict())
+        return loss
+
+    stored = time.monotonic()
+    todo = batches(geometry, motions, config, (seed,), step, total, device)
+    for batch, target in progress(todo, total - step, f"training, batches of {config.batch} pairs, swap: {config.swap}"):
         loss = loss_unweighted(net.train()(batch), target)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        lr = scheduler.get_last_lr()[0]
+        rate = scheduler.get_last_lr()[0]
         scheduler.step()
         step += 1
         losses.append(loss.item())
         if step % per_epoch == 0:
-            say(f"epoch {step // per_epoch}/{config.epochs}: loss {np.mean(losses):.4f} (eq. 2), learning rate {lr:.1e}")
+            say(f"epoch {step // per_epoch}/{config.epochs}: loss {np.mean(losses):.4f} (eq. 2), learning rate {rate:.1e}")
             losses = []
-        if step == total or time.monotonic() - saved > 300:
-            save(run / "checkpoint.pt", config=config_dict(config), model=net.state_dict(), optimizer=optimizer.state_dict(),
-                 scheduler=scheduler.state_dict(), step=step, losses=losses, **remember)
-            usable = D3DLO(config).to(device)
-            usable.load_state_dict(net.state_dict())
-            recompute = list(batches(geometry, motions, config, [seed, 1], 0, min(25, total), device))
-            loss_train = recompute_statistics(usable, recompute)
-            save(run / "weights.pt", config=config_dict(config), model=usable.state_dict(), step=step, **remember)
-            saved = time.monotonic()
-    loss_eval = mean_loss(usable.eval(), recompute)
-    say(f"loss over {len(recompute)} training batches: {loss_train:.4f} in train mode, {loss_eval:.4f} in eval mode")
+        if time.monotonic() - stored > 300:
+            store()
+            stored = time.monotonic()
+    loss_train = store()
+    loss_eval = mean_loss(usable.eval(), fixed_batches())
+    say(f"loss over {min(25, total)} batches, weights fixed: {loss_train:.4f} in train mode, {loss_eval:.4f} in eval mode")
     return usable
-
-
-def config_dict(config):
-    return json.loads(json.dumps(asdict(config)))       # plain lists, which torch.load takes back with weights_only=True
 
 
 # ----------------------------------------------------------------------------------------------- sections 5 and 6: evaluation
 
-def evaluate(net, sequences, geometry, out, state, device="cpu"):
-    """Runs the network over sequences, writes OUT/NN.txt (KITTI pose files) and OUT/results.json, and returns (results, table).
+def evaluate_network(net, state, sequences, geometry, out, source, device="cpu"):
+    """Run the network over sequences, write OUT/NN.txt (KITTI pose files) and OUT/results.json (with `source`), return the table.
 
-    Beside the network stand two trivial predictors: standing still, and the mean motion of the training set.
+    Beside the network stand two trivial predictors: standing still, and the mean motion of the training set. Rows whose data
+    the weights were trained on are marked, by the data's fingerprint and not by name.
     """
-    trained_on = state.get("train", {})
-    predictors = {"D3DLO": {}, "standing still": {}, "mean motion of the training set": {}}
-    constant = {"standing still": np.eye(4), "mean motion of the training set": from_vector(state["mean_motion"])}
+    constant = {"standing still": np.eye(4), "mean motion of training": from_vector(state["mean_motion"])}
+    scores = {predictor: {} for predictor in ("network", *constant)}      # predictor -> sequence -> segment and step errors
     for s, records in progress(zip(sequences, geometry), len(sequences), "registering, sequences"):
-        motions = predict_motions(net, records, device)
-        metrics.write_poses(out / f"{s.name}.txt", kitti.velo_to_camera(accumulate(motions), s.Tr))
-        if s.poses is not None:
-            for name, scores in predictors.items():
-                poses = accumulate(motions if name == "D3DLO" else np.broadcast_to(constant[name], motions.shape))
-                scores[s.name] = (metrics.segment_errors(s.poses_cam, kitti.velo_to_camera(poses, s.Tr)),
-                                  metrics.step_errors(s.poses, poses))
-    known = {s.name: trained_on.get(s.name) == fingerprint(s) for s in sequences}
+        motions = {"network": predict_motions(net, records, device)}
+        motions |= {name: np.broadcast_to(T, motions["network"].shape) for name, T in constant.items()}
+        for predictor, T in motions.items():
+            poses = accumulate(T)
+            poses_cam = kitti.velo_to_camera(poses, s.Tr)
+            if predictor == "network":
+                metrics.write_poses(out / f"{s.name}.txt", poses_cam)
+            if s.poses is not None:
+                scores[predictor][s.name] = metrics.segment_errors(s.poses_cam, poses_cam), metrics.step_errors(s.poses, poses)
+    known = {s.name: state["train"].get(s.name) == fingerprint(s) for s in sequences}
 
-    def score(names, predictor="D3DLO"):
-        scores = [predictors[predictor][name] for name in names]
-        return metrics.summary([s for s, _ in scores], [s for _, s in scores]) | {"trained_on": any(known[n] for n in names)}
+    def summary(names, predictor="network"):
+        pooled = [scores[predictor][name] for name in names if name in scores[predictor]]
+        return metrics.summary([e for e, _ in pooled], [e for _, e in pooled]) | {"trained_on": any(known[n] for n in names)}
 
-    truth = list(predictors["D3DLO"])
-    splits = {split: [n for n in names if n in truth] for split, names in SPLITS.items()}
-    groups = {split: names for split, names in splits.items() if names} | {"all": truth}
-    results = {"sequences": {s.name: score([s.name] if s.name in truth else []) for s in sequences},
-               "splits": {split: score(names) for split, names in groups.items() if split != "all"}, "pooled": score(truth),
-               "predictors": {p: {group: score(names, p) for group, names in groups.items()} for p in constant}}
-    rows = [metrics.row(name + " *" * known[name], results["sequences"][name]) for name in results["sequences"]]
-    for group, names in groups.items():
-        rows.append(metrics.row(group + " *" * any(known[n] for n in names), score(names)))
-        rows += [metrics.row(f"  {p}", score(names, p)) for p in constant]
-    return results, metrics.table(metrics.HEADER, rows)
-
-
-def report(net, state, sequences, geometry, out, weights, data, device):
-    """`evaluate`, then write OUT/results.json; returns the lines to print: table, units, where things lie."""
-    out.mkdir(parents=True, exist_ok=True)
-    results, table = evaluate(net, sequences, geometry, out, state, device)
-    results = {"weights": str(weights), "data": str(data), **results}
+    splits = {split: [n for n in names if n in known] for split, names in SPLITS.items()}
+    groups = {split: names for split, names in splits.items() if names} | {"all": list(known)}
+    each = {name: summary([name]) for name in known}
+    pooled = {group: {p: summary(names, p) for p in scores} for group, names in groups.items()}
+    results = {**source, "sequences": each, "splits": {g: p["network"] for g, p in pooled.items() if g != "all"},
+               "pooled": pooled["all"]["network"], "predictors": {c: {g: p[c] for g, p in pooled.items()} for c in constant}}
+    plain = json.loads(json.dumps(results), parse_constant=lambda nan: None)    # JSON has no NaN
     with metrics.replacing(out / "results.json") as temporary:
-        temporary.write_text(json.dumps(results, indent=1, default=float).replace("NaN", "null") + "\n")
-    return (f"{table}\n* trained on. E_t, E_r: KITTI's segments of 100..800 m, rectified left camera frame. t step, r step: mean length and "
-            f"angle\n  of inv(T_est) @ T_true of a step, Velodyne frame. -: no segment of 100 m, or no ground truth.\n"
-            f"trajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)\nfigures       {out}/results.json")
+        temporary.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
+    rows = [metrics.row(name, each[name]) for name in each]
+    for group in pooled:
+        rows += [metrics.row(group if p == "network" else f"  {p}", s) for p, s in pooled[group].items()]
+    for row, s in zip(rows, [*each.values(), *(s for group in pooled.values() for s in group.values())]):
+        row[0] += " *" * (s["trained_on"] and not row[0].startswith(" "))
+    return (metrics.table(metrics.HEADER, rows) + "\n*: trained on. E_t, E_r: KITTI's segments of 100 to 800 m, rectified left camera "
+            "frame. t step, r step: mean length and\nangle of inv(T_est) @ T_true of a step, Velodyne frame. -: no such segment, or no "
+            f"ground truth.\ntrajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)\nfigures       {out}/results.json")
 
 
 # ------------------------------------------------------------------------------------------------------------- command line
 
-SIMULATED = Path("data/simulated")      # made under the current folder when no --data is given
-
-
 def train(data=None, sequences=None, out=None, epochs=None, batch=None, seed=0, device="cpu", short=False, resume=False):
-    """Train on `sequences` of `data` (None: the simulated city), evaluate on what there is of the test and validation splits.
-    Returns the run folder. See `python d3dlo.py train --help`. ValueError, FileNotFoundError."""
+    """The command `train`: train on `sequences` of `data` (None: the simulated city), evaluate on what there is of the test and
+    validation splits beside them. Returns the run folder. ValueError, FileNotFoundError."""
+    check_device(device)
     run = Path(out or time.strftime("runs/%Y-%m-%d-%H%M%S"))
     if (run / "checkpoint.pt").exists() and not resume:
         raise ValueError(f"{run}: holds a training already; add --resume to go on with it, or choose another --out")
-    changes = {"epochs": epochs, "batch": batch}
-    config = replace(Config(**(SHORT if short or not data else {})), **{k: v for k, v in changes.items() if v})
+    config = Config(**(SHORT if short or not data else {}))
+    config = replace(config, epochs=epochs or config.epochs, batch=batch or config.batch)
     root = Path(data) if data else kitti.simulate(SIMULATED)
     there = [s.name for s in kitti.open_sequences(root)]
     chosen = kitti.open_sequences(root, sequences or ("train" if set(SPLITS["train"]) & set(there) else "all"))
-    for s in chosen:
-        if s.poses is None:
-            raise ValueError(f"{root}/poses/{s.name}.txt: no such file; training on sequence {s.name} needs its ground truth")
     names = [s.name for s in chosen]
+    for s in chosen:
+        if s.poses is None or len(s) < 2:
+            raise ValueError(f"{root}/poses/{s.name}.txt: no such file, or only one scan; sequence {s.name} is nothing to train on")
     held_out = kitti.open_sequences(root, [n for n in SPLITS["test"] + SPLITS["validation"] if n in there and n not in names])
-    state = resume_from(run, chosen) if resume else None
+    remember = {"train": {s.name: fingerprint(s) for s in chosen},
+                "mean_motion": to_vector(np.concatenate([s.motions() for s in chosen])).mean(0).tolist()}
+    state = load_checkpoint(run, remember["train"], device) if resume else None
+    geometry = load_geometry(chosen + held_out, config)
 
     run.mkdir(parents=True, exist_ok=True)
     arguments = dict(data=data, sequences=names, epochs=epochs, batch=batch, seed=seed, device=device, short=short)
     versions = {"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__, "torch": torch.__version__}
     with metrics.replacing(run / "config.json") as temporary:
-        temporary.write_text(json.dumps(dict(arguments=arguments, config=asdict(config), versions=versions), indent=1) + "\n")
+        temporary.write_text(json.dumps(dict(arguments=arguments, config=config.as_dict(), versions=versions), indent=1) + "\n")
 
     def say(line):
         print(line, flush=True)
         with open(run / "log.txt", "a", encoding="utf-8") as log:
             log.write(line + "\n")
 
-    geometry = load_geometry(chosen + held_out, config)
-    motions = [s.motions() for s in chosen]
     torch.manual_seed(seed)
-    net = D3DLO(config).to(device)
+    net, motions = D3DLO(config).to(device), [s.motions() for s in chosen]
     say(f"{sum(p.numel() for p in net.parameters()):,} parameters, {sum(map(len, motions)):,} pairs of scans, {config.epochs} epochs of "
         f"{steps_per_epoch(motions, config)} batches -> {run}")
-    remember = {"train": {s.name: fingerprint(s) for s in chosen}, "mean_motion": to_vector(np.concatenate(motions)).mean(0).tolist()}
     net = fit(net, geometry[:len(chosen)], motions, run, seed, device, state, say, **remember)
     if held_out:
-        say(report(net, remember, held_out, geometry[len(chosen):], run / "results", run / "weights.pt", root, device))
+        source = {"weights": str(run / "weights.pt"), "data": str(root)}
+        say(evaluate_network(net, remember, held_out, geometry[len(chosen):], run / "results", source, device))
     say(f"weights       {run}/weights.pt\nnext          python d3dlo.py eval --weights {run}" + (f" --data {data}" if data else ""))
     return run
 
 
-def resume_from(run, sequences):
+def load_checkpoint(run, fingerprints, device):
     try:
-        state = torch.load(run / "checkpoint.pt", weights_only=True)
-        trained = state["train"]
+        state = torch.load(run / "checkpoint.pt", map_location=device, weights_only=True)
+        same = state["train"] == fingerprints
     except FileNotFoundError:
-        raise FileNotFoundError(f"{run}/checkpoint.pt: no such file, nothing to resume") from None
-    except Exception as error:
-        raise ValueError(f"{run}/checkpoint.pt: not a checkpoint ({type(error).__name__})") from None
-    if trained != {s.name: fingerprint(s) for s in sequences}:
-        raise ValueError(f"{run}: was trained on other data than it finds now; resume with the data unchanged")
+        raise FileNotFoundError(f"{run}/checkpoint.pt: no such file, so there is nothing to resume; train without --resume") from None
+    except Exception as error:      # torch and pickle raise many kinds
+        raise ValueError(f"{run}/checkpoint.pt: not a checkpoint ({type(error).__name__}); train anew with another --out") from None
+    if not same:
+        raise ValueError(f"{run}/checkpoint.pt: was trained on other data than lies there now; resume with the data it was begun with")
     return state
 
 
-def evaluate_command(data=None, weights=None, sequences=None, out=None, device="cpu"):
-    """The command `eval`: prints the table of `weights` (None: shipped) on `sequences` of `data` (None: the simulated test and
-    validation sequences) and returns the folder with its results. ValueError, FileNotFoundError."""
+def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu"):
+    """The command `eval`: print the table of `weights` (None: shipped) on `sequences` of `data` (None: the simulated test and
+    validation sequences). Returns the folder with trajectories and figures. ValueError, FileNotFoundError."""
+    check_device(device)
     net, state = load_weights(weights, device)
     out = Path(out or time.strftime("results/%Y-%m-%d-%H%M%S"))
     root = Path(data) if data else kitti.simulate(SIMULATED, sequences=SPLITS["test"] + SPLITS["validation"])
-    chosen = kitti.open_sequences(root, sequences or ("all" if data else ["test", "validation"]))
-    print(report(net, state, chosen, load_geometry(chosen, net.config), out, weights or WEIGHTS, root, device))
+    chosen = kitti.open_sequences(root, sequences or ("all" if data else ("test", "validation")))
+    source = {"weights": str(weights or WEIGHTS), "data": str(root)}
+    print(evaluate_network(net, state, chosen, load_geometry(chosen, net.config), out, source, device))
     return out
+
+
+def check_device(device):
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        raise ValueError(f"--device {device}: this PyTorch has none ({str(error).splitlines()[0]})") from None
 
 
 def keep_freed_memory():
@@ -741,9 +760,24 @@ def keep_freed_memory():
         pass
 
 
+def begun_with(run):
+    """The arguments a run was begun with."""
+    try:
+        return json.loads((Path(run) / "config.json").read_text())["arguments"]
+    except (ValueError, KeyError, TypeError, OSError):
+        raise ValueError(f"{run}/config.json: missing or damaged; --resume needs --out RUN, the folder of the training to go on with") from None
+
+
+def positive(text, least=1):
+    if int(text) < least:
+        raise argparse.ArgumentTypeError(f"must be {least} or more")
+    return int(text)
+
+
 def main(argv=None):
     raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(prog="d3dlo", formatter_class=raw, description=__doc__.split("\n\n")[0] + "\n\n" + __doc__.split("\n\n")[-1])
+    paragraphs = __doc__.split("\n\n")
+    parser = argparse.ArgumentParser(prog="d3dlo", formatter_class=raw, description=f"{paragraphs[0]}\n\n{paragraphs[-1]}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="train | eval")
     t = commands.add_parser("train", formatter_class=raw, help="train, then evaluate on the test and validation splits", description=(
         "Train D3DLO, then evaluate it on the test and validation splits.\n\n  python d3dlo.py train\n"
@@ -753,49 +787,33 @@ def main(argv=None):
         "Run D3DLO over sequences, write their trajectories, print KITTI's errors.\n\n  python d3dlo.py eval\n"
         "  python d3dlo.py eval --data ROOT --sequences test\n  python d3dlo.py eval --data ROOT --weights RUN --sequences 11 12"))
     for p in (t, e):
-        p.add_argument("--data", metavar="ROOT", help="folder in KITTI odometry layout (default: a simulated city, made in data/)")
-        p.add_argument("--sequences", nargs="+", metavar="NN", help="names or splits: train, test, validation, all")
+        p.add_argument("--data", metavar="ROOT", help=f"folder in KITTI odometry layout (default: a simulated city, made in {SIMULATED})")
+        p.add_argument("--sequences", nargs="+", metavar="NN", help="names, or splits: train, test, validation, all")
         p.add_argument("--device", default="cpu", help="cpu, cuda or mps (default: cpu)")
     t.add_argument("--out", metavar="RUN", help="folder of the run (default: runs/TIME)")
     t.add_argument("--epochs", type=positive, metavar="N", help=f"default: {Config.epochs}, on the simulated city {SHORT['epochs']}")
     t.add_argument("--batch", type=positive, metavar="N", help=f"pairs in a batch, each in both directions (default: {Config.batch})")
-    t.add_argument("--seed", type=int, default=0)
+    t.add_argument("--seed", type=lambda text: positive(text, 0), default=0, metavar="N", help="of the first weights, the order of pairs and the augmentation (default: 0)")
     t.add_argument("--short", action="store_true", help="the simulated city's recipe on --data: annealed learning rate, augmentation")
     t.add_argument("--resume", action="store_true", help="go on with the training in --out, with the options it was begun with")
-    e.add_argument("--weights", metavar="FILE|RUN", help="weights or folder of a run (default: those shipped)")
+    e.add_argument("--weights", metavar="FILE|RUN", help="weights, or folder of a run (default: those shipped)")
     e.add_argument("--out", metavar="DIR", help="folder for NN.txt and results.json (default: results/TIME)")
     args = vars(parser.parse_args(argv))
     keep_freed_memory()
     try:
         if args.pop("command") == "eval":
-            evaluate_command(**args)
+            evaluate(**args)
         elif args["resume"]:
             train(**begun_with(args["out"]), out=args["out"], resume=True)
         else:
             train(**args)
     except KeyboardInterrupt:
-        print("\nd3dlo: interrupted", file=sys.stderr)
+        print("\nd3dlo: interrupted; a training goes on from its last checkpoint with --out RUN --resume", file=sys.stderr)
         return 130
     except (ValueError, OSError) as error:
         print(f"d3dlo: {error}", file=sys.stderr)
         return 2
     return 0
-
-
-def begun_with(run):
-    """The arguments a run was begun with."""
-    if run is None:
-        raise ValueError("--resume needs --out RUN, the folder of the training to go on with")
-    try:
-        return json.loads((Path(run) / "config.json").read_text())["arguments"]
-    except (ValueError, KeyError, TypeError, FileNotFoundError):
-        raise ValueError(f"{run}/config.json: missing or damaged, so {run} holds no training to resume") from None
-
-
-def positive(text):
-    if int(text) < 1:
-        raise argparse.ArgumentTypeError("must be 1 or more")
-    return int(text)
 
 
 if __name__ == "__main__":

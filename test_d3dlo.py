@@ -1,0 +1,941 @@
+"""Properties of D3DLO. Every expectation comes from an independent source: brute force, SciPy, a definition written out, or a closed
+form. Real data are optional: D3DLO_KITTI names a folder in KITTI odometry layout; without it those tests are skipped."""
+import json, math, os, pickle, re, shutil, subprocess, sys, types, warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from hypothesis import HealthCheck, given, settings, strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
+
+import d3dlo, kitti, metrics
+from d3dlo import D3DLO, Config, Layer, farthest_point_sampling, group_ball, group_knn, load_geometry, load_weights, scan_geometry
+from kitti import from_vector, invert, to_vector
+
+settings.register_profile("d3dlo", deadline=None, derandomize=True, database=None, max_examples=25,
+                          suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
+settings.load_profile("d3dlo")
+
+SEED = st.integers(0, 2 ** 32 - 1)
+HERE = Path(__file__).resolve().parent
+OFFICIAL = HERE / "../shared/kitti/official_poses"
+# every kind of layer, a hundredth of the work
+SMALL = Config(sa1=Layer(2.0, 32, 4, (4, 8, 16)), fe=Layer(None, None, 6, (16, 32)), sa2=Layer(4.0, 16, 8, (32, 32)),
+               sa3=Layer(8.0, 8, 4, (32, 32)), mpn=Layer(None, None, None, (32, 64)), mlp=Layer(None, None, None, (32, 6)))
+generator = np.random.default_rng
+
+
+def cloud(rng, n):
+    """A scan (n,4) in a flat box of 16 m."""
+    return np.c_[rng.uniform(-8, 8, (n, 2)), rng.uniform(-2, 2, n), rng.random(n)].astype(np.float32)
+
+
+def motion(rng, scale=(0.5, 0.2, 0.1, 0.5, 0.5, 2.0), n=()):
+    return from_vector(rng.normal(size=(*np.atleast_1d(n).astype(int), 6)) * scale)
+
+
+def trajectory(rng, n, scale=(2.5, 0.3, 0.1, 0.3, 0.3, 3.0)):
+    return d3dlo.accumulate(from_vector(np.abs(rng.normal(size=(n - 1, 6))) * scale * [1, *rng.choice([-1, 1], 5)]))
+
+
+def move(T, xyz):
+    return xyz @ T[:3, :3].T + T[:3, 3]
+
+
+def moved_scan(T, scan):
+    return np.c_[move(T, scan[:, :3].astype(float)), scan[:, 3]].astype(np.float32)
+
+
+def pairs_of_scans(rng, n, points=64, config=SMALL):
+    """Random clouds and themselves moved, each pair a sequence of two scans: geometry and motions as `fit` takes them."""
+    clouds, motions = [cloud(rng, points) for _ in range(n)], motion(rng, n=n)
+    scans = [(p, moved_scan(invert(T), p)) for p, T in zip(clouds, motions)]
+    return [np.stack([scan_geometry(s, config) for s in pair]) for pair in scans], list(motions[:, None])
+
+
+def drives(scans=6):
+    """Two sequences of unrelated scans, for whatever does not ask what is learned."""
+    rng = generator(0)
+    geometry = [np.stack([scan_geometry(cloud(rng, 48), SMALL) for _ in range(scans)]) for _ in range(2)]
+    return geometry, [motion(rng, n=scans - 1) for _ in range(2)]
+
+
+def a_batch(rng, config=SMALL, pairs=3):
+    geometry, motions = pairs_of_scans(rng, pairs, config.sa1.n_fps + 76, config)
+    return d3dlo.training_batch(geometry, motions, [(i, 0) for i in range(pairs)], config, rng)
+
+
+def a_net(rng, config=SMALL):
+    """Untrained, but with BatchNorm scales of both signs and statistics that fit, so that its answers depend on what it sees."""
+    torch.manual_seed(int(rng.integers(2 ** 31)))
+    net = D3DLO(config)
+    for norm in (m for m in net.modules() if hasattr(m, "running_mean")):
+        norm.weight.data, norm.bias.data = torch.randn_like(norm.weight), torch.randn_like(norm.bias)
+    d3dlo.recompute_statistics(net, [a_batch(rng, config)])
+    return net.eval()
+
+
+def predict(net, p, q):
+    return to_vector(d3dlo.predict_motions(net, np.stack([scan_geometry(s, net.config) for s in (p, q)])))[0]
+
+
+# ------------------------------------------------------------------------------------------------- sampling and grouping
+
+KINDS = st.sampled_from(["grid", "duplicates", "line", "float32", "float64"])
+
+
+def points(rng, kind, N):
+    if kind == "grid":                                  # full of ties, and exact in floating point
+        return rng.integers(-4, 5, (N, 3)).astype(np.float32)
+    if kind == "duplicates":
+        return rng.normal(size=(max(N // 3, 1), 3)).astype(np.float32)[rng.integers(max(N // 3, 1), size=N)]
+    if kind == "line":
+        return np.outer(rng.normal(size=N), [1, 0, 0]).astype(np.float32)
+    return (rng.normal(size=(N, 3)) * [20, 20, 2]).astype(kind)
+
+
+def fps_brute(xyz, n, start=0):
+    picks, near = [start], np.full(len(xyz), np.inf, xyz.dtype)
+    for _ in range(n - 1):
+        d = np.square(xyz - xyz[picks[-1]])
+        near = np.minimum(near, d[:, 0] + d[:, 1] + d[:, 2])
+        picks.append(int(np.argmax(near)))              # the first of equals
+    return np.array(picks)
+
+
+@given(SEED, KINDS, st.sampled_from([1, 2, 3, 191, 192, 193, 385]) | st.integers(1, 1500), st.sampled_from([20, 60, 1500]))
+@settings(max_examples=150)
+def test_fps_equals_brute_force_to_the_index(seed, kind, N, n):
+    xyz, n, start = points(generator(seed), kind, N), min(n, N), seed % N
+    picks = farthest_point_sampling(xyz, n, start)
+    assert_array_equal(picks, fps_brute(xyz, n, start))
+    assert n < N or kind in ("grid", "duplicates") or sorted(picks) == [*range(N)]
+
+
+@given(SEED, st.integers(50, 600))
+def test_fps_is_greedily_farthest_nested_and_indifferent_to_a_rigid_motion(seed, N):
+    rng = generator(seed)
+    xyz = points(rng, "float64", N)                     # generic: rounding cannot flip a pick
+    picks = farthest_point_sampling(xyz, 48)
+    for i in range(1, 48):
+        to_earlier = cdist(xyz, xyz[picks[:i]]).min(axis=1)
+        assert_allclose(to_earlier[picks[i]], to_earlier.max(), rtol=1e-12)
+    assert_array_equal(farthest_point_sampling(xyz, 20), picks[:20])
+    assert_array_equal(farthest_point_sampling(xyz[picks], 20), np.arange(20))      # why SA2's centroids are SA1's first
+    assert_array_equal(farthest_point_sampling(move(motion(rng, [50, 50, 50, 90, 40, 90]), xyz), 48), picks)
+    assert_array_equal(farthest_point_sampling(xyz, 48, tree=cKDTree(xyz)), picks)
+
+
+@pytest.mark.parametrize("N, n", [(5, 6), (5, 0), (0, 1), (1023, 1024)])
+def test_fps_refuses_more_samples_than_points(N, n):
+    with pytest.raises(ValueError, match=f"{n} .*{N}"):
+        farthest_point_sampling(np.zeros((N, 3), np.float32), n)
+
+
+@given(SEED, KINDS, st.integers(1, 300), st.integers(1, 12), st.sampled_from([0.5, 1.0, 2.0, 5.0]))
+def test_group_ball_equals_brute_force(seed, kind, N, n_n, r):
+    rng = generator(seed)
+    xyz, centroids = points(rng, kind, N), rng.integers(N, size=20)
+    D = cdist(xyz[centroids].astype(float), xyz.astype(float))
+    for c, d, row in zip(centroids, D, group_ball(xyz, centroids, r, n_n), strict=True):
+        expected = np.sort(d[d <= r])[:n_n]             # on the grid distances of exactly r occur
+        m = len(expected)
+        assert_allclose(np.sort(d[row[:m]]), expected, rtol=1e-12, atol=1e-12)
+        assert len(set(row[:m])) == m and d[row].min() == 0 and len(row) == n_n
+        assert_array_equal(row[m:], c)                  # the fallback
+
+
+@pytest.mark.parametrize("r", [0.1, 0.3, 1.0, 4.0, 8.0])
+def test_the_radius_is_inclusive_and_a_lonely_centroid_has_itself(r):
+    beyond = np.nextafter(np.nextafter(r, np.inf), np.inf)
+    xyz = np.array([[0, 0, 0], [r, 0, 0], [0, beyond, 0], [100, 0, 0]])
+    assert_array_equal(group_ball(xyz, np.array([0, 3]), r, 4), [[0, 1, 0, 0], [3, 3, 3, 3]])
+
+
+@given(SEED, KINDS, st.integers(1, 300), st.integers(1, 16))
+def test_group_knn_equals_brute_force(seed, kind, N, k):
+    rng = generator(seed)
+    xyz, query = points(rng, kind, N), points(rng, kind, 20)
+    for d, row in zip(cdist(query.astype(float), xyz.astype(float)), group_knn(query, xyz, k), strict=True):
+        assert_allclose(d[row[:N]], np.sort(d)[:k], rtol=1e-12, atol=1e-12)
+        assert len(set(row[:N])) == min(k, N) and len(row) == k
+        assert_array_equal(row[N:], row[0])             # fewer than k points: the nearest once more
+
+
+@given(SEED)
+def test_scan_geometry_is_fps_and_grouping_of_what_is_usable(seed):
+    rng = generator(seed)
+    usable = cloud(rng, 200)
+    junk = np.float32([[np.nan, 0, 0, 0], [0, np.inf, 0, 0], [1, 1, 1, np.nan], [300, 0, 0, 0], [1e30, 0, 0, 0]])
+    g, xyz = scan_geometry(np.insert(usable, rng.integers(1, 200, len(junk)), junk, axis=0), SMALL), usable[:, :3]
+    picks = fps_brute(xyz, 32)
+    neighbours = usable[group_ball(xyz, picks, 2.0, 4)]
+    assert g["dropped"] == 3                            # far away is not broken
+    assert_array_equal(g["xyz"], xyz[picks])
+    assert_array_equal(g["group"], np.concatenate([neighbours[..., :3] - xyz[picks][:, None], neighbours[..., 3:]], -1))
+    assert_array_equal(g["idx2"], group_ball(xyz[picks], np.arange(16), 4.0, 8))
+    assert_array_equal(g["idx3"], group_ball(xyz[picks[:16]], np.arange(8), 8.0, 4))
+
+
+@given(SEED)
+def test_scan_geometry_knows_neither_the_order_of_points_nor_where_the_scan_is(seed):
+    rng = generator(seed)
+    scan, T = cloud(rng, 300), motion(rng, [5, 5, 1, 1, 1, 90])
+    g, h = scan_geometry(scan, SMALL), scan_geometry(moved_scan(T, scan), SMALL)
+    assert scan_geometry(np.r_[scan[:1], rng.permutation(scan[1:])], SMALL).tobytes() == g.tobytes()    # FPS starts at the first point
+    assert_allclose(move(T, g["xyz"]), h["xyz"], atol=1e-4)             # the same picks
+    assert_array_equal(g["idx2"], h["idx2"])
+    assert_allclose(g["group"][..., :3] @ T[:3, :3].T, h["group"][..., :3], atol=1e-4)
+
+
+# --------------------------------------------------------------------------------------------------------------- motions
+
+def by_hand(v):
+    (cr, cp, cy), (sr, sp, sy) = np.cos(np.radians(v[3:])), np.sin(np.radians(v[3:]))
+    Rx, Ry, Rz = [[1, 0, 0], [0, cr, -sr], [0, sr, cr]], [[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]], [[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]
+    return np.block([[np.array(Rz) @ Ry @ Rx, np.reshape(v[:3], (3, 1))], [np.array([0, 0, 0, 1])]])
+
+
+METRES, DEGREES = st.floats(-100, 100), st.floats(-179.9, 179.9)
+
+
+@given(st.tuples(METRES, METRES, METRES, DEGREES, st.floats(-89, 89), DEGREES))
+@settings(max_examples=150)
+def test_vectors_are_extrinsic_xyz_and_survive_the_round_trip(v):
+    assert_allclose(from_vector(v), by_hand(np.array(v)), atol=1e-12)
+    assert_allclose(to_vector(from_vector(v)), v, atol=1e-7)
+
+
+@given(DEGREES, st.sampled_from([90, -90]), st.sampled_from([0, 1e-12, 1e-9, 1e-7, 1e-5, 1e-3, 0.1]), DEGREES)
+@settings(max_examples=150)
+def test_motions_survive_the_round_trip_at_gimbal_lock_without_a_warning(roll, pole, off, yaw):
+    T = by_hand(np.array([1, 2, 3, roll, pole - np.sign(pole) * off, yaw]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert_allclose(from_vector(to_vector(T)), T, atol=1e-6)
+
+
+@given(SEED, st.lists(st.integers(0, 3), max_size=3))
+def test_conversions_keep_leading_shapes(seed, shape):
+    v = generator(seed).normal(size=(*shape, 6))
+    T = from_vector(v)
+    assert T.shape == (*shape, 4, 4) and to_vector(T).shape == v.shape
+    assert_allclose(to_vector(T), v, atol=1e-9)
+    assert_allclose(invert(T), np.linalg.inv(T), atol=1e-12)
+    for i in np.ndindex(*shape):
+        assert_allclose(T[i], by_hand(v[i]), atol=1e-12)
+
+
+@given(SEED)
+def test_camera_and_velodyne_frames_tell_the_same_story(seed):
+    rng = generator(seed)
+    T, Tr, q = motion(rng, [5, 5, 5, 60, 60, 60], n=7), motion(rng, [1, 1, 1, 90, 60, 90]), rng.normal(size=(10, 3))
+    T_cam = kitti.velo_to_camera(T, Tr)
+    assert_allclose(kitti.camera_to_velo(T_cam, Tr), T, atol=1e-12)
+    for velo, cam in zip(T, T_cam):                     # look from the camera, then move; or move, then look from the camera
+        assert_allclose(move(cam, move(Tr, q)), move(Tr, move(velo, q)), atol=1e-12)
+
+
+# --------------------------------------------------------------------------------------------------------------- network
+
+def test_table_1_has_61290_parameters():
+    count = {name: sum(p.numel() for p in block.parameters() if p.requires_grad) for name, block in D3DLO().named_children()}
+    assert count == {"sa1": 868, "fe": 4480, "sa2": 8768, "sa3": 8768, "mpn": 21440, "mlp": 16966} and sum(count.values()) == 61290
+
+
+def plain(net, b):
+    """D3DLO as eqs. 3 and 4 are written: gather, concatenate, Linear, BatchNorm over all rows, ReLU, and the maximum at the end.
+    Uses net's parameters; returns the output and what each BatchNorm's running statistics become."""
+    statistics = {}
+
+    def layer(x, linear, norm):
+        z, statistics[norm] = F.linear(x, linear.weight, linear.bias), (norm.running_mean.clone(), norm.running_var.clone())
+        y = F.batch_norm(z.flatten(0, -2), *statistics[norm], norm.weight, norm.bias, net.training, norm.momentum, norm.eps)
+        return F.relu(y).view_as(z)
+
+    def h(block, x):
+        for linear, norm in zip(block.linears, block.norms, strict=True):
+            x = layer(x, linear, norm)
+        return x
+
+    def take(x, idx):                                   # (B,n,D), (B,S,k) -> (B,S,k,D)
+        return torch.stack([rows[i] for rows, i in zip(x, idx)])
+
+    feat = h(net.sa1.h, b.group).amax(2)                # SA1, shared: one BatchNorm over the clouds of both sides
+    x, f, y, g = b.xyz[b.p], feat[b.p], b.xyz[b.q], feat[b.q]
+    y_j, g_j = take(y, b.idx_fe), take(g, b.idx_fe)
+    f = h(net.fe.h, torch.cat([y_j - x[:, :, None], f[:, :, None].expand_as(g_j), g_j], -1)).amax(2)            # eq. 4
+    for sa, idx in (net.sa2, b.idx2[b.p]), (net.sa3, b.idx3[b.p]):
+        centroids = x[:, :idx.shape[1]]
+        x, f = centroids, h(sa.h, torch.cat([take(x, idx) - centroids[:, :, None], take(f, idx)], -1)).amax(2)  # eq. 3
+    linear, norm, _, last = net.mlp
+    return F.linear(layer(h(net.mpn, f).amax(1), linear, norm), last.weight, last.bias), statistics
+
+
+@pytest.mark.parametrize("config", [SMALL, replace(SMALL, swap="random", sa3=Layer(0.1, 8, 4, (32, 32)))])      # with all-fallback balls
+@pytest.mark.parametrize("training", [True, False])
+@given(seed=SEED)
+def test_the_network_is_equations_3_and_4(training, config, seed):
+    rng = generator(seed)
+    net = a_net(rng, config).double().train(training)
+    batch = d3dlo.Batch(*(a.double() if a.is_floating_point() else a for a in a_batch(rng, config)[0]))
+    expected, statistics = plain(net, batch)
+    got, weights = net(batch), torch.from_numpy(rng.normal(size=expected.shape))
+    torch.testing.assert_close(got, expected, rtol=1e-9, atol=1e-9)
+    assert got.std(0).min() > 1e-3                      # the answers differ from pair to pair, so there was something to compare
+    names, parameters = zip(*net.named_parameters())
+    for name, a, b in zip(names, *(torch.autograd.grad((y * weights).sum(), parameters) for y in (got, expected))):
+        torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-8, msg=lambda m: f"{name}: {m}")
+        inert = training and re.search(r"(linears\.\d|mlp\.0)\.bias", name)         # BatchNorm takes any constant away again
+        assert not inert or a.abs().max() < 1e-8
+    for norm, (mean, var) in statistics.items():
+        torch.testing.assert_close((norm.running_mean, norm.running_var), (mean, var), rtol=1e-9, atol=1e-9)
+
+
+def test_gather_add_and_linear_max_have_the_right_gradients():
+    torch.manual_seed(0)
+    u, v, h, W = (torch.randn(s, dtype=float, requires_grad=True) for s in ((2, 5, 3), (2, 4, 3), (2, 4, 3, 5), (6, 5)))
+    idx = torch.randint(5, (2, 4, 7))                   # some points gathered often
+    assert torch.autograd.gradcheck(lambda u, v: d3dlo.GatherAdd.apply(u, v, idx), (u, v))
+    assert torch.autograd.gradcheck(d3dlo.LinearMax.apply, (h, W))
+
+
+@given(SEED)
+def test_linear_max_shares_the_gradient_among_equal_maxima_as_amax_does(seed):
+    rng = generator(seed)
+    h, W = (torch.from_numpy(rng.integers(-1, 2, s).astype(float)).requires_grad_() for s in ((2, 3, 6, 3), (4, 3)))    # exact: real ties
+    (fast, first, second), slow, rows = d3dlo.LinearMax.apply(h, W), (h @ W.t()).amax(2), h.flatten(0, 2)
+    torch.testing.assert_close(fast, slow, rtol=0, atol=0)
+    torch.testing.assert_close((first, second), (rows.mean(0), rows.t() @ rows / len(rows)))
+    grad = torch.from_numpy(rng.normal(size=fast.shape))
+    torch.testing.assert_close(*(torch.autograd.grad(y, (h, W), grad) for y in (fast, slow)))
+
+
+@given(SEED)
+def test_the_prediction_knows_neither_the_order_of_points_nor_absolute_coordinates(seed):
+    rng = generator(seed)
+    net = a_net(rng)
+    p, q = (np.round(cloud(rng, 108) * 1024) / 1024 for _ in range(2))              # a grid on which shifting by metres is exact
+    expected, shift = predict(net, p, q), np.float32([40, -30, 3, 0])
+    assert_array_equal(predict(net, *(np.r_[s[:1], rng.permutation(s[1:])] for s in (p, q))), expected)
+    assert_allclose(predict(net, p + shift, q + shift), expected, atol=1e-3)        # another motion, but the same flow
+    assert np.abs(predict(net, p, q + shift / 32) - expected).max() > 0.01          # shifting one alone does matter
+
+
+def test_recomputed_statistics_close_the_gap_between_train_and_eval():
+    rng = generator(0)
+    geometry, motions = pairs_of_scans(rng, 32)
+    net, batches = a_net(rng), list(d3dlo.batches(geometry, motions, replace(SMALL, augment=True), (0,), 0, 6))
+    net.mlp[3].weight.data *= 10                        # so that a loss shows what the statistics do
+    for norm in (m for m in net.modules() if hasattr(m, "running_mean")):           # and let them lag far behind
+        norm.running_mean.neg_(), norm.running_var.mul_(10)
+    before = d3dlo.mean_loss(net.eval(), batches)
+    loss_train = d3dlo.recompute_statistics(net, batches)
+    loss_eval = d3dlo.mean_loss(net.eval(), batches)
+    assert abs(loss_eval - loss_train) < 0.02 * loss_train and abs(loss_eval - loss_train) < 0.2 * abs(before - loss_train)
+    assert {m.momentum for m in net.modules() if hasattr(m, "running_mean")} == {0.1}       # as it was
+    first, norm = net.sa1.h.linears[0], net.sa1.h.norms[0]      # written out: the plain mean over batches of means, of unbiased variances
+    z = [F.linear(b.group, first.weight, first.bias).flatten(0, -2) for b, _ in batches]
+    torch.testing.assert_close(norm.running_mean, torch.stack([a.mean(0) for a in z]).mean(0), rtol=1e-3, atol=1e-4)
+    torch.testing.assert_close(norm.running_var, torch.stack([a.var(0) for a in z]).mean(0), rtol=1e-3, atol=1e-4)
+
+
+# -------------------------------------------------------------------------------------------------------------- training
+
+def test_sixteen_pairs_can_be_learned_by_heart(tmp_path):
+    geometry, motions = pairs_of_scans(generator(0), 16)
+    config, said = replace(SMALL, epochs=150, lr=1e-2, schedule="one-cycle"), []
+    torch.manual_seed(0)
+    net = d3dlo.fit(D3DLO(config), geometry, motions, tmp_path, 0, "cpu", say=said.append)
+    first, last = (float(re.search(r"loss ([\d.]+)", line)[1]) for line in (said[0], said[-2]))
+    assert first > 0.3 and last < 0.02                  # eq. 2 in train mode, m and degrees alike
+    assert d3dlo.mean_loss(net.eval(), d3dlo.batches(geometry, motions, config, (0,), 0, 1)) < 0.02
+    got = to_vector(np.concatenate([d3dlo.predict_motions(net, records) for records in geometry]))
+    assert np.abs(got - to_vector(np.concatenate(motions))).mean() < 0.02           # and by the path that odometry takes
+
+
+def same_batch(a, b):
+    return all(torch.equal(x, y) for x, y in zip((*a[0], a[1]), (*b[0], b[1]), strict=True))
+
+
+@given(SEED, st.sampled_from(["both", "random"]), st.booleans(), st.integers(1, 9))
+def test_batches_depend_on_seed_and_step_alone(seed, swap, augmented, batch):
+    config, (geometry, motions) = replace(SMALL, swap=swap, augment=augmented, batch=batch), drives()
+    steps = 2 * math.ceil(10 / batch)                   # two epochs
+    whole = list(d3dlo.batches(geometry, motions, config, (seed,), 0, steps))
+    for k in (0, 1, steps // 2, steps - 1):
+        resumed = list(d3dlo.batches(geometry, motions, config, (seed,), k, steps))
+        assert len(resumed) == steps - k and all(map(same_batch, whole[k:], resumed))
+    assert not same_batch(whole[0], next(d3dlo.batches(geometry, motions, config, (seed + 1,), 0, 1)))
+    assert not augmented or not same_batch(whole[0], whole[steps // 2])             # another epoch draws anew
+
+
+@given(SEED, st.sampled_from(["both", "random"]), st.integers(1, 9))
+def test_an_epoch_holds_every_pair_once_with_the_motion_of_its_direction(seed, swap, batch):
+    config, (geometry, motions) = replace(SMALL, swap=swap, batch=batch), drives()
+    name, seen = {g["xyz"].tobytes(): (s, i) for s, records in enumerate(geometry) for i, g in enumerate(records)}, []
+    for b, target in d3dlo.batches(geometry, motions, config, (seed,), 0, math.ceil(10 / batch)):
+        for p, q, y in zip(b.p, b.q, target, strict=True):
+            (s, i), (s_, j) = (name[b.xyz[c].numpy().tobytes()] for c in (p, q))
+            T = motions[s][min(i, j)]
+            assert s == s_ and abs(i - j) == 1
+            assert_allclose(y, to_vector(T if i < j else np.linalg.inv(T)), atol=1e-5)
+            seen.append((s, min(i, j), i < j))
+        assert swap == "random" or 2 * len({pair[:2] for pair in seen}) == len(seen)        # both directions in one batch
+    assert sorted({pair[:2] for pair in seen}) == [(s, i) for s in range(2) for i in range(5)]
+    assert len(seen) == len(set(seen)) == (20 if swap == "both" else 10) and {forward for *_, forward in seen} == {True, False}
+
+
+@given(SEED)
+def test_augmented_pairs_still_fit_their_motion(seed):
+    rng = generator(seed)
+    geometry, motions = pairs_of_scans(rng, 6, points=200)
+    assert all(g[0]["idx2"].tobytes() == g[1]["idx2"].tobytes() for g in geometry)  # Q is P moved: the same points in the same order
+    clouds, T = np.stack([g[d] for d in (0, 1) for g in geometry]), np.concatenate(motions)
+    before = clouds.copy()
+    T_new = d3dlo.augment(clouds, T, rng)
+    for p, q, old, X, Y in zip(clouds[:6], clouds[6:], before[:6], T_new, T):
+        assert_allclose(move(X, q["xyz"]), p["xyz"], atol=1e-4)
+        assert_allclose(move(X, q["xyz"][:, None] + q["group"][..., :3]), p["xyz"][:, None] + p["group"][..., :3], atol=1e-4)
+        assert np.linalg.det(X[:3, :3]) > 0.999 and np.abs(X - Y).max() > 1e-3      # no reflection is left, and something moved
+        assert_array_equal(np.abs(p["xyz"]), np.abs(old["xyz"]))                    # P is at most mirrored
+    for field in ("idx2", "idx3"):
+        assert_array_equal(clouds[field], before[field])
+    assert_array_equal(clouds["group"][..., 3], before["group"][..., 3])
+
+
+@given(SEED, st.integers(1, 32))
+def test_the_loss_is_equation_2(seed, B):
+    y, y_hat = generator(seed).normal(size=(2, B, 6))
+    expected = sum(sum(abs(a - b) for a, b in zip(r, s)) / 6 for r, s in zip(y, y_hat)) / B
+    assert_allclose(d3dlo.loss_unweighted(torch.tensor(y_hat), torch.tensor(y)), expected)
+
+
+def fit(folder, config, resume=None, stop=None):
+    """Train on `drives()`; `stop` interrupts at the line that starts so. Returns the lines said."""
+    said = []
+
+    def say(line):
+        said.append(line)
+        if stop and line.startswith(stop):
+            raise KeyboardInterrupt
+    torch.manual_seed(0 if resume is None else 99)      # a resumed net must not depend on how it starts
+    try:
+        d3dlo.fit(D3DLO(config), *drives(), folder, 7, "cpu", resume, say)
+    except KeyboardInterrupt:
+        pass
+    return said
+
+
+@pytest.mark.parametrize("schedule", ["steps", "one-cycle"])
+def test_a_resumed_training_ends_in_the_same_weights(tmp_path, monkeypatch, schedule):
+    config, clock = replace(SMALL, epochs=5, batch=4, schedule=schedule, augment=True), iter(range(0, 10 ** 9, 1000))
+    monkeypatch.setattr(d3dlo, "time", types.SimpleNamespace(monotonic=lambda: next(clock)))    # in a hurry: a checkpoint after each step
+    whole, part = fit(tmp_path / "whole", config), fit(tmp_path / "part", config, stop="epoch 3/")
+    state = torch.load(tmp_path / "part" / "checkpoint.pt", weights_only=True)
+    assert state["step"] == 8 and len(part) == 3        # of 15, in the middle of an epoch
+    assert fit(tmp_path / "part", config, resume=state) == whole[2:]
+    for name in ("checkpoint.pt", "weights.pt"):
+        a, b = (torch.load(tmp_path / folder / name, weights_only=True) for folder in ("whole", "part"))
+        assert a["step"] == b["step"] == 15 and all(torch.equal(tensor, b["model"][key]) for key, tensor in a["model"].items())
+
+
+def test_resuming_a_finished_training_leaves_it_as_it_is(tmp_path):
+    fit(tmp_path, replace(SMALL, epochs=1))
+    before, weights = (torch.load(tmp_path / name, weights_only=True) for name in ("checkpoint.pt", "weights.pt"))
+    fit(tmp_path, replace(SMALL, epochs=1), resume=before)
+    after = torch.load(tmp_path / "weights.pt", weights_only=True)
+    assert after["step"] == 1 and all(torch.equal(tensor, after["model"][key]) for key, tensor in weights["model"].items())
+
+
+# --------------------------------------------------------------------------------------------------------------- metrics
+
+def devkit(T_gt, T_est):
+    """KITTI's trajectoryDistances, lastFrameFromSegmentLength and calcSequenceErrors, loop by loop."""
+    dist, errors = [0.0], []
+    for a, b in zip(T_gt, T_gt[1:]):
+        dx, dy, dz = a[:3, 3] - b[:3, 3]
+        dist.append(dist[-1] + math.sqrt(dx * dx + dy * dy + dz * dz))
+    for first in range(0, len(T_gt), 10):
+        for length in (100, 200, 300, 400, 500, 600, 700, 800):
+            last = -1
+            for i in range(first, len(T_gt)):
+                if dist[i] > dist[first] + length:
+                    last = i
+                    break
+            if last == -1:
+                continue
+            delta_gt, delta_est = np.linalg.inv(T_gt[first]) @ T_gt[last], np.linalg.inv(T_est[first]) @ T_est[last]
+            error = np.linalg.inv(delta_est) @ delta_gt
+            d = 0.5 * (error[0, 0] + error[1, 1] + error[2, 2] - 1.0)
+            r, t = math.acos(max(min(d, 1.0), -1.0)), math.sqrt(error[0, 3] ** 2 + error[1, 3] ** 2 + error[2, 3] ** 2)
+            errors.append((first, last, length, 100 * t / length, math.degrees(r) / length))
+    return np.array(errors).reshape(-1, 5)
+
+
+def perturbed(rng, T):
+    return d3dlo.accumulate(invert(T[:-1]) @ T[1:] @ motion(rng, (0.02, 0.01, 0.01, 0.02, 0.02, 0.05), len(T) - 1))
+
+
+def straight(n, step=1.0):
+    T = np.tile(np.eye(4), (n, 1, 1))
+    T[:, 2, 3] = step * np.arange(n)                    # the camera looks along z
+    return T
+
+
+@given(SEED, st.integers(1, 350))
+def test_segment_errors_are_the_devkits(seed, n):
+    rng = generator(seed)
+    T_gt = trajectory(rng, n)
+    T_est = perturbed(rng, T_gt)
+    expected, got = devkit(T_gt, T_est), metrics.segment_errors(T_gt, T_est)
+    for field, column, tolerance in zip(("first", "last", "length", "t_err", "r_err"), expected.T, (0, 0, 0, 1e-7, 1e-6)):
+        assert_allclose(got[field], column, rtol=tolerance, atol=tolerance / 100)
+
+
+@pytest.mark.skipif(not OFFICIAL.is_dir(), reason="no official poses here")
+@pytest.mark.parametrize("name", ["04", "07", "10"])
+def test_figures_on_official_poses_are_the_devkits(name, tmp_path):
+    T_gt = metrics.read_poses(OFFICIAL / f"{name}.txt")
+    metrics.write_poses(tmp_path / "est.txt", perturbed(generator(0), T_gt))
+    T_est = metrics.read_poses(tmp_path / "est.txt")
+    assert_allclose(metrics.kitti_errors([metrics.segment_errors(T_gt, T_est)]), devkit(T_gt, T_est)[:, 3:].mean(0), rtol=1e-4)
+    assert_allclose(from_vector(to_vector(T_gt)), T_gt, atol=1e-5)                  # its rotations have seven digits
+
+
+@given(st.floats(-0.5, 0.5), st.integers(102, 900))
+def test_a_scale_error_on_a_straight_drive_has_its_closed_form(scale, n):
+    got = metrics.segment_errors(straight(n), straight(n, 1 + scale))
+    # a metre a frame: 100 m are not strictly longer than 100 m, so a segment is a metre longer than its name
+    assert_array_equal(got["last"] - got["first"], got["length"] + 1)
+    assert_allclose(got["t_err"], 100 * abs(scale) * (got["length"] + 1) / got["length"], rtol=1e-9, atol=1e-12)
+    assert_allclose(got["r_err"], 0, atol=1e-9)
+    assert len(got) == sum(first + length + 1 < n for first in range(0, n, 10) for length in range(100, 801, 100))
+
+
+@given(st.floats(-0.2, 0.2), st.integers(102, 500))
+def test_a_constant_yaw_drift_has_its_closed_form(drift, n):
+    T_est = d3dlo.accumulate(from_vector(np.tile([0, 0, 1.0, 0, drift, 0], (n - 1, 1))))        # the camera's y axis points down
+    got, turns = metrics.segment_errors(straight(n), T_est), np.radians(drift) * np.arange(n)
+    m = got["last"] - got["first"]
+    x, z = (np.r_[0, np.cumsum(f(turns))][m] for f in (np.sin, np.cos))             # a sum of unit steps, each turned a little further
+    assert_allclose(got["r_err"], abs(drift) * m / got["length"], atol=1e-7)
+    assert_allclose(got["t_err"], 100 * np.hypot(x, z - m) / got["length"], atol=1e-6)
+    assert_allclose(metrics.step_errors(straight(n), T_est), np.tile([0, abs(drift)], (n - 1, 1)), atol=1e-9)
+
+
+@given(SEED, st.integers(2, 150))
+def test_step_errors_are_what_was_put_in_and_nothing_without_an_error(seed, n):
+    rng = generator(seed)
+    T, angle, t = trajectory(rng, n), rng.uniform(0, 179, n - 1), rng.normal(size=(n - 1, 3))
+    E = np.tile(np.eye(4), (n - 1, 1, 1))
+    E[:, :3, 3] = t
+    for e, a, w in zip(E, rng.normal(size=(n - 1, 3)), np.radians(angle)):          # Rodrigues
+        K = np.cross(np.eye(3), -a / np.linalg.norm(a))
+        e[:3, :3] += np.sin(w) * K + (1 - np.cos(w)) * K @ K
+    got = metrics.step_errors(T, d3dlo.accumulate(invert(T[:-1]) @ T[1:] @ E))
+    assert_allclose(got, np.stack([np.linalg.norm(t, axis=1), angle], 1), atol=1e-7)
+    elsewhere = motion(rng, [50, 50, 50, 90, 60, 90]) @ T                           # where a trajectory starts does not matter
+    assert_allclose(metrics.step_errors(T, elsewhere), 0, atol=1e-9)
+    for field in ("t_err", "r_err"):
+        assert_allclose(metrics.segment_errors(T, elsewhere)[field], 0, atol=1e-7)
+
+
+def test_metrics_refuse_lengths_that_differ_and_print_nothing_as_a_dash(tmp_path, capsys):
+    for error in (metrics.segment_errors, metrics.step_errors, metrics.absolute_errors):
+        with pytest.raises(ValueError, match="20 .*19"):
+            error(straight(20), straight(19))
+    assert np.isnan([metrics.kitti_errors([]), metrics.kitti_errors([metrics.segment_errors(straight(20), straight(20))])]).all()
+    metrics.write_poses(tmp_path / "a.txt", straight(20))
+    assert metrics.main([str(tmp_path / "a.txt")] * 2) == 0
+    assert capsys.readouterr().out.splitlines()[1].split()[:5] == ["a", "0", "-", "-", "0.0000"]
+
+
+@given(SEED, st.integers(1, 30))
+def test_pose_files_survive_the_round_trip(tmp_path, seed, n):
+    T, path = trajectory(generator(seed), n), tmp_path / "new" / "a.txt"
+    metrics.write_poses(path, T)
+    assert_allclose(metrics.read_poses(path), T, rtol=1e-8, atol=1e-8)
+    assert os.listdir(path.parent) == ["a.txt"] and np.loadtxt(path, ndmin=2).shape == (n, 12)
+
+
+ROW = "1 0 0 0 0 1 0 0 0 0 1 0"
+BAD_POSES = {"eleven": (f"{ROW}\n{ROW[:-2]}", "line 2"), "thirteen": (f"{ROW} 0", "line 1"), "words": (f"{ROW}\nframe 1", "line 2"),
+             "infinite": (ROW[:-1] + "inf", "line 1"), "empty": ("\n\n", "no pose"), "no rotation": (f"{ROW}\n2{ROW[1:]}", "pose 1"),
+             "a mirror": ("-" + ROW, "pose 0")}
+
+
+@pytest.mark.parametrize("text, words", BAD_POSES.values(), ids=BAD_POSES)
+def test_read_poses_says_what_is_wrong_and_where(tmp_path, text, words):
+    (tmp_path / "bad.txt").write_text(text)
+    with pytest.raises(ValueError, match=rf"bad\.txt.*{words}"):
+        metrics.read_poses(tmp_path / "bad.txt")
+    with pytest.raises(FileNotFoundError, match=r"gone\.txt"):
+        metrics.read_poses(tmp_path / "gone.txt")
+
+
+# ------------------------------------------------------------------------------------------------------------------ data
+
+@given(SEED, st.floats(-8, 8), st.floats(-8, 8))
+def test_remove_plane_takes_the_ground_and_leaves_the_box(seed, roll, pitch):
+    rng = generator(seed)
+    ground = np.c_[rng.uniform(-20, 20, (3000, 2)), rng.normal(0, 0.02, 3000), rng.random(3000)]
+    box = np.c_[rng.uniform(-8, 8, (1500, 2)), rng.uniform(0.4, 3, 1500), rng.random(1500)]
+    scan, order = moved_scan(by_hand(np.array([0, 0, -1.7, roll, pitch, 0])), np.r_[ground, box]), rng.permutation(4502)
+    scan = np.r_[scan, np.full((2, 4), np.nan, np.float32)][order]
+    left = kitti.remove_plane(scan, seed=seed)
+    assert_array_equal(left, scan[order >= 3000])       # all of the ground, nothing else, the order kept, NaN too
+    assert_array_equal(kitti.remove_plane(scan, seed=seed), left)
+
+
+@pytest.mark.parametrize("N", [0, 2, 500])
+def test_remove_plane_without_a_plane_changes_nothing(N):
+    rng = generator(0)
+    wall = np.c_[np.zeros(N), rng.uniform(-9, 9, N), rng.uniform(-2, 9, N), rng.random(N)].astype(np.float32)
+    assert_array_equal(kitti.remove_plane(wall), wall)
+
+
+def files_of(root):
+    return {str(p.relative_to(root)): p.read_bytes() for p in Path(root).rglob("*") if p.is_file()}
+
+
+@pytest.fixture(scope="session")
+def city(tmp_path_factory):
+    """Two simulated sequences of 8 scans, one of the training and one of the validation split. Read only."""
+    return kitti.simulate(tmp_path_factory.mktemp("city"), sequences=("00", "07"), scans=8, azimuth=300, workers=1)
+
+
+def test_the_simulation_gives_the_same_bytes_however_it_is_made(city, tmp_path):
+    def simulate(to, names, **more):
+        return files_of(kitti.simulate(to, sequences=names, scans=8, azimuth=300, **more))
+    made = files_of(city)
+    assert simulate(tmp_path / "two", ("07", "00"), workers=2) == made
+    alone, other = simulate(tmp_path / "alone", ("07",), workers=1), simulate(tmp_path / "other", ("07",), workers=1, seed=1)
+    assert alone.items() <= made.items() and len(alone) == 12
+    assert all(other[name] != made[name] for name in alone if name.endswith((".bin", "07.txt")))
+    assert simulate(city, ("00", "07")) == made         # what is there is left alone
+
+
+def test_the_simulation_is_in_kittis_layout(city):
+    for s in kitti.open_sequences(city):
+        assert len(s) == len(s.poses) == len(s.times) == 8
+        assert_allclose(s.poses[0], np.eye(4), atol=1e-8)
+        assert np.abs(s.Tr[:3, :3] - np.eye(3)).max() > 0.9 and np.abs(s.Tr[:3, 3]).max() > 0.1     # a mistake of frames would show
+        for scan in map(s.scan, range(8)):
+            far = np.linalg.norm(scan[:, :3], axis=1)
+            assert scan.dtype == np.float32 and len(scan) > 5000 and np.isfinite(scan).all() and 1 < far.min() and far.max() < 80.5
+            assert 0 <= scan[:, 3].min() and scan[:, 3].max() <= 1
+
+
+def test_simulated_scans_fit_their_poses(tmp_path):
+    s, = kitti.open_sequences(kitti.simulate(tmp_path, sequences=("00",), scans=3, azimuth=900, workers=1))
+    for i, T in enumerate(s.motions()):
+        p, q = s.scan(i)[:, :3], s.scan(i + 1)[:, :3]
+        q, tree = q[q[:, 2] > -1.2], cKDTree(p)         # on the ground every motion along it fits
+        right, *wrong = (np.median(tree.query(move(M, q))[0]) for M in (T, np.eye(4), invert(T), kitti.velo_to_camera(T, s.Tr)))
+        assert right < 0.1 and min(wrong) > 3 * right
+
+
+def test_simulated_test_drives_are_long_and_winding_enough_to_be_measured(tmp_path):
+    errors, steps = [], []
+    for s in kitti.open_sequences(kitti.simulate(tmp_path, sequences=["test"], azimuth=16, workers=1)):
+        v = to_vector(s.motions())
+        errors.append(metrics.segment_errors(s.poses, d3dlo.accumulate(from_vector(v * [1, 1, 1, 0, 0, 0]))))
+        steps.append(v)
+        assert metrics.path_lengths(s.poses)[-1] > 115 and len(errors[-1])
+    steps = np.concatenate(steps)
+    assert metrics.kitti_errors(errors)[0] > 40         # the true translation without rotation must not do well
+    assert steps[:, 5].std() > 0.9 and 0.8 < np.linalg.norm(steps[:, :3], axis=1).mean() < 1.2
+
+
+@pytest.mark.skipif("D3DLO_KITTI" not in os.environ, reason="D3DLO_KITTI names no folder")
+def test_real_scans_are_sampled_exactly_and_lose_their_ground():
+    for s in kitti.open_sequences(os.environ["D3DLO_KITTI"]):
+        scan = s.scan(len(s) // 2)
+        xyz, g = np.ascontiguousarray(scan[:, :3]), scan_geometry(scan)
+        assert_array_equal(farthest_point_sampling(xyz, 128), fps_brute(xyz, 128))
+        assert 0.25 < 1 - len(kitti.remove_plane(scan)) / len(scan) < 0.65
+        assert np.linalg.norm(g["group"][..., :3], axis=-1).max() <= 1.0001 and g["idx2"].max() < 1024 and g["idx3"].max() < 256
+
+
+def write_root(root, names=("00",), scans=4, size=1100, step=1.0):
+    """KITTI's layout with random scans, for whatever does not look at what is learned."""
+    rng, Tr = generator(0), by_hand(np.array([0.1, -0.2, 0.3, -90, 0, -90]))
+    for name in names:
+        folder = root / "sequences" / name
+        (folder / "velodyne").mkdir(parents=True)
+        for i in range(scans):
+            cloud(rng, size).tofile(folder / "velodyne" / f"{i:06d}.bin")
+        (folder / "calib.txt").write_text(f"P0: {ROW}\nTr: {' '.join(map(repr, Tr[:3].ravel().tolist()))}\n")
+        (folder / "times.txt").write_text("".join(f"{0.1 * i}\n" for i in range(scans)))
+        metrics.write_poses(root / "poses" / f"{name}.txt", trajectory(rng, scans, np.array([step, 0.1, 0.1, 0.3, 0.3, 1])))
+    return root
+
+
+def test_the_cache_holds_what_scan_geometry_says_and_is_made_anew_when_anything_changes(tmp_path):
+    root, cache = write_root(tmp_path / "root", ("00", "drive"), size=60), tmp_path / "cache"
+
+    def load(config=SMALL):
+        sequences = kitti.open_sequences(root)
+        for s, records in zip(sequences, load_geometry(sequences, config, cache), strict=True):
+            assert [r.tobytes() for r in records] == [scan_geometry(s.scan(i), config).tobytes() for i in range(len(s))]
+        return {p: p.stat().st_mtime_ns for p in cache.iterdir()}
+    first, path = load(), root / "sequences" / "drive" / "velodyne" / "000002.bin"  # neither the first scan nor the last
+    assert len(first) == 2 and load() == first          # nothing is made twice
+    stamp = path.stat().st_mtime_ns + 10 ** 9
+    cloud(generator(5), 60).tofile(path)                # of the same size
+    os.utime(path, ns=(stamp, stamp))
+    assert len(load()) == 3                             # one sequence changed
+    assert len(load(replace(SMALL, sa1=Layer(1.0, *SMALL.sa1[1:])))) == 5
+    assert len(load(replace(SMALL, sa2=Layer(4.0, 12, 8, (32, 32))))) == 7
+    assert len(load(replace(SMALL, fe=Layer(None, None, 3, (16, 32)), lr=5.0))) == 7        # what it does not depend on
+
+
+def test_a_bad_scan_leaves_nothing_in_the_cache_and_is_named(tmp_path):
+    root, cache = write_root(tmp_path / "root", scans=8, size=60), tmp_path / "cache"
+    cloud(generator(0), 20).tofile(root / "sequences" / "00" / "velodyne" / "000005.bin")
+    with pytest.raises(ValueError, match=r"000005\.bin.*20 usable"):
+        load_geometry(kitti.open_sequences(root), SMALL, cache)
+    assert list(cache.iterdir()) == []
+
+
+# --------------------------------------------------------------------------------------------------- weights and odometry
+
+def save_weights(path, config=Config()):
+    """A file as `fit` writes it, of a network that was never trained."""
+    net = a_net(generator(0), config)
+    torch.save(dict(config=config.as_dict(), model=net.state_dict(), step=0, train={}, mean_motion=[1.0, 0, 0, 0, 0, 0]), path)
+    return net
+
+
+@pytest.mark.parametrize("config", [SMALL, replace(SMALL, batch=3, swap="random", sa1=Layer(1.5, 40, 5, (6, 10))), Config()])
+def test_weights_rebuild_their_network_from_the_file_itself(tmp_path, config):
+    net, rng = save_weights(tmp_path / "weights.pt", config), generator(0)
+    p, q = cloud(rng, 1100), cloud(rng, 1100)
+    for path in (tmp_path / "weights.pt", tmp_path):    # a file, or the run folder that holds it
+        loaded, _ = load_weights(path)
+        assert loaded.config == config and not loaded.training
+        assert_array_equal(predict(loaded, p, q), predict(net, p, q))
+
+
+@given(SEED)
+def test_odometry_multiplies_relative_poses_and_a_refused_scan_changes_nothing(tmp_path, seed):
+    rng, w = generator(seed), tmp_path / "w.pt"
+    net, scans, expected = save_weights(w, SMALL), [cloud(rng, 60) for _ in range(5)], np.eye(4)
+    odometry = d3dlo.Odometry(w)
+    for i, scan in enumerate(scans):
+        for bad in (np.zeros((60, 3)), np.zeros(60), scan[:10], np.full((60, 4), np.nan), np.full((60, 4), 99.0)):
+            with pytest.raises(ValueError):
+                odometry.register(bad)
+        expected = expected @ d3dlo.relative_pose(scans[i - 1], scan, w) if i else expected
+        pose = odometry.register(scan)
+        assert pose.shape == (4, 4) and pose.dtype == float
+        assert_allclose(pose, expected, atol=1e-9)
+        pose[:] = 0                                     # a copy: the next pose does not mind
+    together = d3dlo.predict_motions(net, np.stack([scan_geometry(s, SMALL) for s in scans]), batch=3)      # and several pairs at a time
+    assert_allclose(d3dlo.accumulate(together)[-1], expected, atol=1e-3)
+
+
+def test_odometry_drops_points_that_are_not_finite_with_a_warning(tmp_path):
+    save_weights(tmp_path / "w.pt", SMALL)
+    p, q = cloud(generator(0), 60), cloud(generator(1), 60)
+    expected = d3dlo.relative_pose(p, q, tmp_path / "w.pt")
+    with pytest.warns(UserWarning, match="1 NaN"):
+        assert_array_equal(d3dlo.relative_pose(p, np.insert(q, 7, np.nan, axis=0), tmp_path / "w.pt"), expected)
+
+
+# ---------------------------------------------------------------------------------------------------------- command line
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """Runs and caches go to the current folder."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture(scope="session")
+def weights(tmp_path_factory):
+    save_weights(path := tmp_path_factory.mktemp("weights") / "weights.pt")
+    return path
+
+
+def complaint(err):
+    """What is on stderr beside lines of progress."""
+    return [line for line in err.splitlines() if line.strip() and not re.search(r": \d+/\d+, .* left$", line.strip())]
+
+
+def fails_with_one_line(main, arguments, words, capsys):
+    code = main(list(map(str, arguments)))
+    out, err = capsys.readouterr()
+    assert code == 2 and len(complaint(err)) == 1 and words in complaint(err)[0] and "Traceback" not in err + out, err
+
+
+def figures(out, name):
+    """The row `name` of a printed table, the star of what was trained on aside: [segments, E_t, E_r, t step, r step, ...]."""
+    return re.search(rf"^{name}(?: \*)? +(\S.*)$", out, re.M)[1].split()
+
+
+def as_printed(s):
+    formats = {"segments": "d", "E_t": ".3f", "E_r": ".5f", "t_step_m": ".4f", "r_step_deg": ".4f"}
+    return ["-" if s[key] is None else format(s[key], f) for key, f in formats.items()]
+
+
+def test_eval_writes_what_it_prints_and_metrics_agrees(here, weights, capsys):
+    root, segments = write_root(here / "root", ("03", "07", "11"), scans=20, step=14), []       # steps of 11 m: there are segments
+    (root / "poses" / "11.txt").unlink()                # a sequence without ground truth gets its trajectory all the same
+    assert d3dlo.main(["eval", "--data", "root", "--weights", str(weights), "--out", "out"]) == 0
+    out, err = capsys.readouterr()
+    results, (net, _) = json.loads((here / "out" / "results.json").read_text()), load_weights(weights)
+    assert complaint(err) == [] and sorted(os.listdir("out")) == ["03.txt", "07.txt", "11.txt", "results.json"]
+    assert list(results["sequences"]) == ["03", "07", "11"] and set(results["splits"]) == {"test", "validation"}
+    for name, s in [*results["sequences"].items(), ("all", results["pooled"])]:
+        assert figures(out, name) == as_printed(s) and s["trained_on"] is False
+    assert results["sequences"]["11"]["E_t"] is None and len(metrics.read_poses("out/11.txt")) == 20
+    for s in kitti.open_sequences(root, ["03", "07"]):  # once more, from the files
+        T, got = metrics.read_poses(here / "out" / f"{s.name}.txt"), results["sequences"][s.name]
+        segments.append(devkit(s.poses_cam, T)[:, 3:])
+        steps = metrics.step_errors(s.poses, kitti.camera_to_velo(T, s.Tr)).mean(0)
+        assert_allclose([got["E_t"], got["E_r"], got["t_step_m"], got["r_step_deg"]], [*segments[-1].mean(0), *steps], rtol=1e-5)
+        expected = d3dlo.accumulate([from_vector(predict(net, s.scan(i), s.scan(i + 1))) for i in range(19)])
+        assert_allclose(kitti.camera_to_velo(T, s.Tr), expected, rtol=1e-3, atol=1e-3)
+    assert_allclose([results["pooled"][key] for key in ("E_t", "E_r")], np.concatenate(segments).mean(0), rtol=1e-5)
+    assert metrics.main(["root/poses", "out"]) == 0     # in the camera's frame: the same segments, other steps
+    out = capsys.readouterr().out
+    assert all(figures(out, name)[:3] == as_printed(results["sequences"][name])[:3] for name in ("03", "07"))
+
+
+def test_train_then_eval_then_train_again(here, city, capsys):
+    arguments = ["train", "--data", str(city), "--epochs", "1", "--out", "run"]
+    assert d3dlo.main(arguments) == 0
+    out, err = capsys.readouterr()
+    assert complaint(err) == [] and "61,290 parameters" in out and not list(here.rglob(".*"))
+    assert {"weights.pt", "checkpoint.pt", "config.json", "log.txt", "results"} == set(os.listdir("run"))
+    trained, before = json.loads((here / "run" / "results" / "results.json").read_text()), (here / "run" / "checkpoint.pt").read_bytes()
+    assert figures(out, "07") == as_printed(trained["sequences"]["07"]) and (here / "run" / "log.txt").read_text() == out
+    assert d3dlo.main(["eval", "--data", str(city), "--weights", "run", "--out", "out"]) == 0
+    results, out = json.loads((here / "out" / "results.json").read_text()), capsys.readouterr().out
+    assert results["sequences"]["07"] == trained["sequences"]["07"]                 # it was held out, and evaluated at the end
+    assert [s["trained_on"] for s in results["sequences"].values()] == [True, False] and re.search(r"^00 \*", out, re.M)
+    fails_with_one_line(d3dlo.main, arguments, "--resume", capsys)                  # never over an earlier training
+    begun = json.loads((here / "run" / "config.json").read_text())
+    begun["arguments"]["data"] = str(write_root(here / "other", ("00", "07"), scans=8))
+    (here / "run" / "config.json").write_text(json.dumps(begun))
+    fails_with_one_line(d3dlo.main, ["train", "--out", "run", "--resume"], "other data", capsys)
+    assert (here / "run" / "checkpoint.pt").read_bytes() == before
+
+
+def rewrite(name, change):
+    return lambda root: (root / name).write_bytes(change((root / name).read_bytes()))
+
+
+SCAN, POSES, CALIB = "sequences/00/velodyne/000001.bin", "poses/00.txt", "sequences/00/calib.txt"
+BAD_DATA = {    # what is done to a good root, and what the complaint must name
+    "no sequences": (lambda root: shutil.rmtree(root / "sequences"), "sequences/"),
+    "raw layout": (lambda root: (root / "sequences").rename(root / "2011_09_26_drive_0005_sync"), "raw data"),
+    "no scans": (lambda root: shutil.rmtree((root / SCAN).parent), "velodyne"),
+    "a scan missing": (lambda root: (root / SCAN).unlink(), SCAN[-10:]),
+    "a scan cut short": (rewrite(SCAN, lambda b: b[:-3]), SCAN),
+    "an empty scan": (rewrite(SCAN, lambda b: b""), SCAN),
+    "too few points": (rewrite(SCAN, lambda b: b[:16 * 1000]), SCAN),
+    "only NaN": (rewrite(SCAN, lambda b: b"\xff" * len(b)), SCAN),
+    "a pose too few": (rewrite(POSES, lambda b: b"\n".join(b.splitlines()[1:])), POSES),
+    "a pose of 11": (rewrite(POSES, lambda b: b.rstrip().rpartition(b" ")[0]), POSES),
+    "a pose of 13": (rewrite(POSES, lambda b: b.rstrip() + b" 1"), POSES),
+    "no calibration": (lambda root: (root / CALIB).unlink(), CALIB),
+    "calibration without Tr": (rewrite(CALIB, lambda b: b.partition(b"Tr")[0]), CALIB),
+    "Tr of 11": (rewrite(CALIB, lambda b: b.rstrip().rpartition(b" ")[0]), CALIB),
+}
+
+
+@pytest.mark.parametrize("spoil, words", BAD_DATA.values(), ids=BAD_DATA)
+def test_bad_data_is_named_in_one_line_and_leaves_nothing_behind(here, weights, capsys, spoil, words):
+    spoil(root := write_root(here / "root"))
+    fails_with_one_line(d3dlo.main, ["eval", "--data", root, "--weights", weights, "--out", "out"], words, capsys)
+    fails_with_one_line(d3dlo.main, ["train", "--data", root, "--epochs", 1, "--out", "run"], words, capsys)
+    assert [name for name in files_of(here) if not name.startswith("root/")] == []
+
+
+BAD_ARGUMENTS = {  # and what the complaint must name
+    "eval --sequences 42": "42", "eval --sequences ../sequences/00": "../sequences/00", "train --sequences test": "test",
+    "eval --data gone": "gone", "eval --weights gone.pt": "gone.pt", "eval --weights root": "root/weights.pt",
+    "train --resume --out gone": "gone", "train --resume": "--out", "eval --device nonsense": "nonsense",
+}
+
+
+@pytest.mark.parametrize("arguments, words", BAD_ARGUMENTS.items())
+def test_bad_arguments_are_named_in_one_line(here, weights, capsys, arguments, words):
+    write_root(here / "root")
+    before, arguments = files_of(here), arguments.split()
+    extra = [] if "--resume" in arguments else ["--out", "out"] + ["--data", "root"] * ("--data" not in arguments)
+    extra += ["--weights", weights] * (arguments[0] == "eval" and "--weights" not in arguments)
+    fails_with_one_line(d3dlo.main, arguments + extra, words, capsys)
+    assert files_of(here) == before
+
+
+class Mischief:
+    def __reduce__(self):
+        return os.mkdir, ("mischief",)
+
+
+def torch_bytes(content):
+    torch.save(content, "content.pt")
+    return Path("content.pt").read_bytes()
+
+
+BAD_WEIGHTS = {     # the bytes of a good file -> those of a bad one
+    "another shape": lambda good: torch_bytes({**torch.load("good.pt"), "config": Config().as_dict()}),
+    "code": lambda good: pickle.dumps(Mischief(), protocol=2), "code by torch": lambda good: torch_bytes({"model": Mischief()}),
+    "cut short": lambda good: good[:-2000], "no config": lambda good: torch_bytes({"model": {}}), "a list": lambda good: torch_bytes([1.0]),
+    "noise": lambda good: generator(0).bytes(5000), "empty": lambda good: b"", "text": lambda good: b"hello",
+}
+
+
+@pytest.mark.parametrize("spoil", BAD_WEIGHTS.values(), ids=BAD_WEIGHTS)
+def test_files_that_are_no_weights_are_named_in_one_line_and_run_no_code(here, capsys, spoil):
+    write_root(here / "root", size=40)
+    save_weights("good.pt", SMALL)
+    (here / "bad.pt").write_bytes(spoil((here / "good.pt").read_bytes()))
+    fails_with_one_line(d3dlo.main, ["eval", "--data", "root", "--weights", "bad.pt", "--out", "out"], "bad.pt", capsys)
+    assert not (here / "out").exists() and not (here / "mischief").exists()
+
+
+def test_metrics_on_the_command_line(here, capsys):
+    gt, est = straight(300), straight(300, 1.01)
+    for name, T in {"gt/03": gt, "gt/07": gt, "est/03": est, "est/07": gt, "short": gt[:-1]}.items():
+        metrics.write_poses(f"{name}.txt", T)
+    assert metrics.main(["gt/03.txt", "est/03.txt"]) == 0
+    expected, out = devkit(gt, est)[:, 3], capsys.readouterr().out
+    assert figures(out, "03")[:5] == [str(len(expected)), f"{expected.mean():.3f}", "0.00000", "0.0100", "0.0000"]
+    assert figures(out, "100 m")[1] == "1.010" and figures(out, "200 m")[1] == "1.005"
+    assert metrics.main(["gt", "est"]) == 0
+    assert figures(capsys.readouterr().out, "all")[1] == f"{expected.mean() / 2:.3f}"       # pooled: 07 is without error
+    for bad in (["gt/03.txt", "gone.txt"], ["gt/03.txt", "short.txt"], ["gt", "est/03.txt"], ["gt", str(here)]):
+        fails_with_one_line(metrics.main, bad, bad[1], capsys)
+
+
+def test_simulate_on_the_command_line(here, city, capsys):
+    arguments = ["simulate", "city", "--sequences", "07", "--scans", "8", "--azimuth", "300"]
+    assert kitti.main(arguments) == 0
+    assert "8 scans" in capsys.readouterr().out and files_of("city").items() <= files_of(city).items()
+    write_root(here / "real")
+    before = files_of(here)
+    for change, words in {"--azimuth 400": "07", "--azimuth 3": "azimuth", "--scans 0": "scans", "--sequences ../x": "../x"}.items():
+        fails_with_one_line(kitti.main, arguments + change.split(), words, capsys)
+    fails_with_one_line(kitti.main, ["simulate", "real", "--sequences", "00", "--scans", "2"], "00", capsys)        # never over real data
+    assert files_of(here) == before and not list(here.rglob(".*"))
+
+
+def test_as_a_user_sees_it(tmp_path, weights):
+    def user(*arguments):
+        ran = subprocess.run([sys.executable, *map(str, arguments)], cwd=tmp_path, capture_output=True, text=True, timeout=300,
+                             env={**os.environ, "PYTHONPATH": str(HERE)})
+        return ran.returncode, ran.stdout, ran.stderr
+    assert user("-c", "import d3dlo") == (0, "", "") and os.listdir(tmp_path) == []         # importing is silent and writes nothing
+    rewrite(SCAN, lambda b: b[:16 * 1000])(write_root(tmp_path / "root"))
+    code, out, err = user(HERE / "d3dlo.py", "eval", "--data", "root", "--weights", weights)
+    assert (code, out, len(complaint(err))) == (2, "", 1) and SCAN in complaint(err)[0]
