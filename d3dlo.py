@@ -67,6 +67,7 @@ class Config:
     mpn: Layer = Layer(None, None, None, (64, 256))
     mlp: Layer = Layer(None, None, None, (64, 6))
 
+    spread: int = 8             # which n_n of a ball: spread over the nearest 8 n_n of them; 1: the nearest. Not in the paper
     epochs: int = 500           # section 4
     batch: int = 16             # pairs; not in the paper
     lr: float = 1e-3            # Adam's default; the peak of the one-cycle schedule
@@ -127,14 +128,17 @@ def farthest_point_sampling(xyz, n, start=0, tree=None):
     return picks
 
 
-def group_ball(xyz, centroids, r, n_n, tree=None):
-    """The ball of eq. 3: (N,3) points, (S,) indices of the centroids among them -> (S,n_n) indices.
+def group_ball(xyz, centroids, r, n_n, tree=None, spread=1):
+    """The ball of eq. 3: (N,3) points, (S,) indices of the centroids among them -> (S,n_n) indices of points within r metres, r
+    included: the nearest n_n, or with spread > 1 n_n in even steps, from first to last, of the nearest spread * n_n.
 
-    The nearest n_n points within r metres, r included, the centroid itself among them; where there are fewer, the missing slots
-    hold the centroid's own index (section 3.3.2), which changes no maximum.
+    The first is the centroid (or a point in the same place). Where there are fewer, the missing slots hold the centroid's own
+    index (section 3.3.2), which changes no maximum. `tree`, a cKDTree of xyz, saves building one.
     """
-    _, idx = (tree or cKDTree(xyz)).query(xyz[centroids], [*range(1, n_n + 1)], distance_upper_bound=np.nextafter(r, np.inf))
-    return np.where(idx == len(xyz), centroids[:, None], idx)                                  # scipy marks a missing one by N
+    _, idx = (tree or cKDTree(xyz)).query(xyz[centroids], [*range(1, spread * n_n + 1)], distance_upper_bound=np.nextafter(r, np.inf))
+    size = (idx < len(xyz)).sum(1, keepdims=True)                                              # (S,1); scipy marks a missing one by N
+    rank = np.rint(np.arange(n_n) * np.maximum((size - 1) / max(n_n - 1, 1), 1)).astype(int)   # (S,n_n): 0, 1, 2 ... when all fit
+    return np.where(rank < size, np.take_along_axis(idx, rank, 1), centroids[:, None])
 
 
 def group_knn(query, xyz, k):
@@ -171,11 +175,11 @@ def scan_geometry(scan, config=Config()):
     centroids = farthest_point_sampling(cloud, n1, tree=tree)
     out = np.empty((), geometry_dtype(config))
     out["xyz"] = xyz = cloud[centroids]                                                        # (n1,3)
-    group = scan[group_ball(cloud, centroids, r1, k1, tree)]                                   # (n1,k1,4)
+    group = scan[group_ball(cloud, centroids, r1, k1, tree, config.spread)]                                   # (n1,k1,4)
     group[..., :3] -= xyz[:, None]
     out["group"] = group
-    out["idx2"] = group_ball(xyz, np.arange(n2), r2, k2)
-    out["idx3"] = group_ball(xyz[:n2], np.arange(n3), r3, k3)
+    out["idx2"] = group_ball(xyz, np.arange(n2), r2, k2, spread=config.spread)
+    out["idx3"] = group_ball(xyz[:n2], np.arange(n3), r3, k3, spread=config.spread)
     out["dropped"] = (~finite).sum()
     return out
 
@@ -206,7 +210,7 @@ def load_geometry(sequences, config, cache="cache"):
     files = []
     for s in sequences:
         depends = (fingerprint(s), [p.stat().st_mtime_ns for p in s.scan_paths], dtype.descr, config.sa1.r, config.sa2.r,
-                   config.sa3.r, MAX_RANGE)
+                   config.sa3.r, config.spread, MAX_RANGE)
         files.append(Path(cache) / f"{s.name}-{hashlib.sha256(repr(depends).encode()).hexdigest()[:16]}.npy")
     missing = [(s, file) for s, file in zip(sequences, files) if not file.is_file()]
     if missing:

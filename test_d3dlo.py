@@ -137,15 +137,18 @@ def test_fps_refuses_more_samples_than_points(N, n):
         farthest_point_sampling(np.zeros((N, 3), np.float32), n)
 
 
-@given(SEED, KINDS, st.integers(1, 300), st.integers(1, 12), st.sampled_from([0.5, 1.0, 2.0, 5.0]))
-def test_group_ball_equals_brute_force(seed, kind, N, n_n, r):
+@given(SEED, KINDS, st.integers(1, 300), st.integers(1, 12), st.sampled_from([0.5, 1.0, 2.0, 5.0]), st.integers(1, 4))
+@settings(max_examples=50)
+def test_group_ball_equals_brute_force(seed, kind, N, n_n, r, spread):
     rng = generator(seed)
     xyz, centroids = points(rng, kind, N), rng.integers(N, size=20)
     D = cdist(xyz[centroids].astype(float), xyz.astype(float))
-    for c, d, row in zip(centroids, D, group_ball(xyz, centroids, r, n_n), strict=True):
-        expected = np.sort(d[d <= r])[:n_n]             # on the grid distances of exactly r occur
-        m = len(expected)
-        assert_allclose(np.sort(d[row[:m]]), expected, rtol=1e-12, atol=1e-12)
+    for c, d, row in zip(centroids, D, group_ball(xyz, centroids, r, n_n, spread=spread), strict=True):
+        expected = np.sort(d[d <= r])[:spread * n_n]    # on the grid distances of exactly r occur
+        m = min(len(expected), n_n)
+        evenly = [round(j * (len(expected) - 1) / max(n_n - 1, 1)) for j in range(n_n)]
+        expected = expected[evenly] if len(expected) > n_n else expected
+        assert_allclose(np.sort(d[row[:m]]), expected, rtol=1e-6, atol=1e-6)
         assert len(set(row[:m])) == m and d[row].min() == 0 and len(row) == n_n
         assert_array_equal(row[m:], c)                  # the fallback
 
@@ -154,7 +157,8 @@ def test_group_ball_equals_brute_force(seed, kind, N, n_n, r):
 def test_the_radius_is_inclusive_and_a_lonely_centroid_has_itself(r):
     beyond = np.nextafter(np.nextafter(r, np.inf), np.inf)
     xyz = np.array([[0, 0, 0], [r, 0, 0], [0, beyond, 0], [100, 0, 0]])
-    assert_array_equal(group_ball(xyz, np.array([0, 3]), r, 4), [[0, 1, 0, 0], [3, 3, 3, 3]])
+    for spread in (1, 3):
+        assert_array_equal(group_ball(xyz, np.array([0, 3]), r, 4, spread=spread), [[0, 1, 0, 0], [3, 3, 3, 3]])
 
 
 @given(SEED, KINDS, st.integers(1, 300), st.integers(1, 16))
@@ -167,19 +171,19 @@ def test_group_knn_equals_brute_force(seed, kind, N, k):
         assert_array_equal(row[N:], row[0])             # fewer than k points: the nearest once more
 
 
-@given(SEED)
-def test_scan_geometry_is_fps_and_grouping_of_what_is_usable(seed):
+@given(SEED, st.sampled_from([1, 3]))
+def test_scan_geometry_is_fps_and_grouping_of_what_is_usable(seed, spread):
     rng = generator(seed)
     usable = cloud(rng, 200)
     junk = np.float32([[np.nan, 0, 0, 0], [0, np.inf, 0, 0], [1, 1, 1, np.nan], [300, 0, 0, 0], [1e30, 0, 0, 0]])
-    g, xyz = scan_geometry(np.insert(usable, rng.integers(1, 200, len(junk)), junk, axis=0), SMALL), usable[:, :3]
+    g, xyz = scan_geometry(np.insert(usable, rng.integers(1, 200, len(junk)), junk, axis=0), replace(SMALL, spread=spread)), usable[:, :3]
     picks = fps_brute(xyz, 32)
-    neighbours = usable[group_ball(xyz, picks, 2.0, 4)]
+    neighbours = usable[group_ball(xyz, picks, 2.0, 4, spread=spread)]
     assert g["dropped"] == 3                            # far away is not broken
     assert_array_equal(g["xyz"], xyz[picks])
     assert_array_equal(g["group"], np.concatenate([neighbours[..., :3] - xyz[picks][:, None], neighbours[..., 3:]], -1))
-    assert_array_equal(g["idx2"], group_ball(xyz[picks], np.arange(16), 4.0, 8))
-    assert_array_equal(g["idx3"], group_ball(xyz[picks[:16]], np.arange(8), 8.0, 4))
+    assert_array_equal(g["idx2"], group_ball(xyz[picks], np.arange(16), 4.0, 8, spread=spread))
+    assert_array_equal(g["idx3"], group_ball(xyz[picks[:16]], np.arange(8), 8.0, 4, spread=spread))
 
 
 @given(SEED)
@@ -693,7 +697,8 @@ def test_the_cache_holds_what_scan_geometry_says_and_is_made_anew_when_anything_
     assert len(load()) == 3                             # one sequence changed
     assert len(load(replace(SMALL, sa1=Layer(1.0, *SMALL.sa1[1:])))) == 5
     assert len(load(replace(SMALL, sa2=Layer(4.0, 12, 8, (32, 32))))) == 7
-    assert len(load(replace(SMALL, fe=Layer(None, None, 3, (16, 32)), lr=5.0))) == 7        # what it does not depend on
+    assert len(load(replace(SMALL, spread=2))) == 9
+    assert len(load(replace(SMALL, fe=Layer(None, None, 3, (16, 32)), lr=5.0))) == 9        # what it does not depend on
 
 
 def test_a_bad_scan_leaves_nothing_in_the_cache_and_is_named(tmp_path):
