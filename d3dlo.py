@@ -87,7 +87,7 @@ class Config:
         return json.loads(json.dumps(asdict(self)))
 
 
-SHORT = dict(epochs=14, lr=4e-3, schedule="one-cycle", augment=True)     # the 15-minute training on the simulated city
+SHORT = dict(epochs=11, batch=8, lr=1e-2, schedule="one-cycle", augment=True)      # the 15-minute training on the simulated city
 
 
 # ------------------------------------------------------------------------ section 3.3.2, 3.3.3: sampling and grouping (NumPy)
