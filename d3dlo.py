@@ -87,10 +87,25 @@ class Config:
         return json.loads(json.dumps(asdict(self)))
 
 
-SHORT = dict(epochs=11, batch=8, lr=1e-2, schedule="one-cycle", augment=True)      # the 15-minute training on the simulated city
+SHORT = dict(epochs=9, batch=8, lr=1e-2, schedule="one-cycle", augment=True)      # the 15-minute training on the simulated city
 
 
-# ------------------------------------------------------------------------ section 3.3.2, 3.3.3: sampling and grouping (NumPy)
+# ------------------------------------------------------------------------------------ sections 3.1, 3.2: problem and objective
+
+def accumulate(motions):
+    """Eq. 1: (n-1,4,4) T_{t,t+1} -> (n,4,4) T_{0,t}, the first the identity."""
+    poses = [np.eye(4)]
+    for T in motions:
+        poses.append(poses[-1] @ T)
+    return np.stack(poses)
+
+
+def loss_unweighted(y_hat, y):
+    """Eq. 2: the mean absolute error over metres and degrees alike. (B,6), (B,6) -> ()."""
+    return (y - y_hat).abs().mean()
+
+
+# ----------------------------------------------------------------------- sections 3.3.2, 3.3.3: sampling and grouping (NumPy)
 
 def farthest_point_sampling(xyz, n, start=0, tree=None):
     """Exact farthest point sampling: (N,3) -> (n,) int64 indices. Each pick is the point farthest from all picks before it.
@@ -175,7 +190,7 @@ def scan_geometry(scan, config=Config()):
     centroids = farthest_point_sampling(cloud, n1, tree=tree)
     out = np.empty((), geometry_dtype(config))
     out["xyz"] = xyz = cloud[centroids]                                                        # (n1,3)
-    group = scan[group_ball(cloud, centroids, r1, k1, tree, config.spread)]                                   # (n1,k1,4)
+    group = scan[group_ball(cloud, centroids, r1, k1, tree, config.spread)]                    # (n1,k1,4)
     group[..., :3] -= xyz[:, None]
     out["group"] = group
     out["idx2"] = group_ball(xyz, np.arange(n2), r2, k2, spread=config.spread)
@@ -422,18 +437,16 @@ def load_weights(path=None, device="cpu"):
     path = Path(path or WEIGHTS)
     path = path / "weights.pt" if path.is_dir() else path
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such weights; `python d3dlo.py train` makes some, --weights names them")
+        raise FileNotFoundError(f"{path}: no such file; `python d3dlo.py train` makes weights, --weights names them")
     try:
         state = torch.load(path, map_location=device, weights_only=True)
-        net = D3DLO(Config(**state["config"])).to(device).eval()
-        state["train"], from_vector(state["mean_motion"])
-    except Exception as error:      # torch and pickle raise many kinds; to the user they are one
-        raise ValueError(f"{path}: not D3DLO weights ({type(error).__name__}); give a weights.pt or a run folder") from None
-    try:
+        net = D3DLO(Config(**state["config"])).to(device)
         net.load_state_dict(state["model"])
-    except (RuntimeError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: its weights do not fit the network it describes ({str(error).splitlines()[-1].strip()})") from None
-    return net, state
+        state["step"], state["train"], from_vector(state["mean_motion"])
+    except Exception as error:      # torch and pickle raise many kinds; to the user they are one
+        reason = f"{type(error).__name__}: {error}".splitlines()[-1].strip()
+        raise ValueError(f"{path}: no weights of D3DLO ({reason:.120}); give a weights.pt or a run folder") from None
+    return net.eval(), state
 
 
 # --------------------------------------------------------------------------------------------------------- odometry, eq. 1
@@ -447,14 +460,6 @@ def predict_motions(net, records, device="cpu", batch=16):
         p = np.arange(len(clouds) - 1)
         out.append(net(make_batch(clouds, p, p + 1, net.config, device)).cpu().numpy())
     return from_vector(np.concatenate([np.empty((0, 6)), *out]))
-
-
-def accumulate(motions):
-    """Eq. 1: (n-1,4,4) T_{t,t+1} -> (n,4,4) T_{0,t}, the first the identity."""
-    poses = [np.eye(4)]
-    for T in motions:
-        poses.append(poses[-1] @ T)
-    return np.stack(poses)
 
 
 class Odometry:
@@ -543,11 +548,6 @@ def batches(geometry, motions, config, seed, start, stop, device="cpu"):
 
 def steps_per_epoch(motions, config):
     return math.ceil(sum(map(len, motions)) / config.batch)
-
-
-def loss_unweighted(y_hat, y):
-    """Eq. 2: the mean absolute error over metres and degrees alike. (B,6), (B,6) -> ()."""
-    return (y - y_hat).abs().mean()
 
 
 def recompute_statistics(net, batches):
@@ -663,11 +663,9 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu")
     plain = json.loads(json.dumps(results), parse_constant=lambda nan: None)    # JSON has no NaN
     with metrics.replacing(out / "results.json") as temporary:
         temporary.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
-    rows = [metrics.row(name, each[name]) for name in each]
-    for group in pooled:
-        rows += [metrics.row(group if p == "network" else f"  {p}", s) for p, s in pooled[group].items()]
-    for row, s in zip(rows, [*each.values(), *(s for group in pooled.values() for s in group.values())]):
-        row[0] += " *" * (s["trained_on"] and not row[0].startswith(" "))
+    rows = [metrics.row(name + " *" * s["trained_on"], s) for name, s in each.items()]
+    for group, predictions in pooled.items():
+        rows += [metrics.row(group + " *" * s["trained_on"] if p == "network" else f"  {p}", s) for p, s in predictions.items()]
     return (metrics.table(metrics.HEADER, rows) + "\n*: trained on. E_t, E_r: KITTI's segments of 100 to 800 m, rectified left camera "
             "frame. t step, r step: mean length and\nangle of inv(T_est) @ T_true of a step, Velodyne frame. -: no such segment, or no "
             f"ground truth.\ntrajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)\nfigures       {out}/results.json")
@@ -694,7 +692,9 @@ def train(data=None, sequences=None, out=None, epochs=None, batch=None, seed=0, 
     held_out = kitti.open_sequences(root, [n for n in SPLITS["test"] + SPLITS["validation"] if n in there and n not in names])
     remember = {"train": {s.name: fingerprint(s) for s in chosen},
                 "mean_motion": to_vector(np.concatenate([s.motions() for s in chosen])).mean(0).tolist()}
-    state = load_checkpoint(run, remember["train"], device) if resume else None
+    state = load_weights(run / "checkpoint.pt", device)[1] if resume else None
+    if state and state["train"] != remember["train"]:
+        raise ValueError(f"{run}/checkpoint.pt: was trained on other data than lies there now; resume with the data it was begun with")
     geometry = load_geometry(chosen + held_out, config)
 
     run.mkdir(parents=True, exist_ok=True)
@@ -718,19 +718,6 @@ def train(data=None, sequences=None, out=None, epochs=None, batch=None, seed=0, 
         say(evaluate_network(net, remember, held_out, geometry[len(chosen):], run / "results", source, device))
     say(f"weights       {run}/weights.pt\nnext          python d3dlo.py eval --weights {run}" + (f" --data {data}" if data else ""))
     return run
-
-
-def load_checkpoint(run, fingerprints, device):
-    try:
-        state = torch.load(run / "checkpoint.pt", map_location=device, weights_only=True)
-        same = state["train"] == fingerprints
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{run}/checkpoint.pt: no such file, so there is nothing to resume; train without --resume") from None
-    except Exception as error:      # torch and pickle raise many kinds
-        raise ValueError(f"{run}/checkpoint.pt: not a checkpoint ({type(error).__name__}); train anew with another --out") from None
-    if not same:
-        raise ValueError(f"{run}/checkpoint.pt: was trained on other data than lies there now; resume with the data it was begun with")
-    return state
 
 
 def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu"):

@@ -255,8 +255,8 @@ CELL = 0.5  # m, of the ground's raster
 SCANS = {"train": 320, "test": 170, "validation": 170}  # per sequence: enough for 100 m segments, few enough to make on the spot
 # what a sequence is like: cruising speed [m/s], odds of a street corner every 35-80 m, stops, odds of (dense, suburban, open) surroundings
 STYLES = {"00": (12, 0.55, 0, (6, 3, 1)), "01": (19, 0.1, 0, (1, 3, 4)), "02": (15, 0.4, 0, (1, 6, 2)), "08": (12, 0.5, 1, (4, 4, 1)),
-          "09": (16, 0.35, 0, (2, 4, 3)), "03": (13, 0.5, 0, (2, 5, 2)), "04": (15, 0.45, 0, (3, 3, 3)), "05": (12, 0.55, 0, (6, 3, 1)),
-          "06": (14, 0.5, 0, (3, 5, 1)), "10": (13, 0.5, 0, (2, 4, 3)), "07": (12, 0.5, 0, (6, 3, 1))}
+          "09": (16, 0.35, 0, (2, 4, 3)), "03": (10, 0.5, 0, (2, 5, 2)), "04": (18.5, 0.2, 0, (3, 3, 3)), "05": (12, 0.55, 1, (6, 3, 1)),
+          "06": (16, 0.4, 0, (3, 5, 1)), "10": (13, 0.5, 1, (2, 4, 3)), "07": (12, 0.5, 1, (6, 3, 1))}
 
 
 def _drive(rng, scans, style):
