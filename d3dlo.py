@@ -1,8 +1,9 @@
-"""D3DLO: Deep 3D LiDAR Odometry (Adis, Horst, Wien; ICIP 2021). The whole method in this file, in the paper's order.
+"""D3DLO: Deep 3D LiDAR Odometry (Adis, Horst, Wien; ICIP 2021). Sections 3 and 4 in the paper's order.
 
 Two LiDAR scans in, the motion between them out: set abstraction on each scan, a flow embedding between them, two more set
-abstractions, a mini-PointNet, an MLP; 61,290 parameters. Geometry is computed once, in NumPy, from coordinates alone
-(sampling and grouping depend on no weight); only what is learned is torch.
+abstractions, a mini-PointNet, an MLP; 61,290 parameters. Sampling and grouping depend on no weight, so they are NumPy: those
+of a scan are computed once and cached, only the neighbours between two scans are found for each pair. What is learned is torch.
+The vector of section 3.2 and the plane of section 4 are in kitti.py, section 5's E_t and E_r in metrics.py.
 
 Frame: Velodyne, x forward, y left, z up, metres. `T_ab` maps points of frame b into frame a. A motion is T_{t,t+1} (eq. 1), as
 a vector [tx, ty, tz] in metres and [roll, pitch, yaw] in degrees. Shapes: N points of a scan, S centroids, k neighbours of each,
@@ -17,14 +18,12 @@ import ctypes
 import hashlib
 import json
 import math
-import multiprocessing
 import os
 import platform
-import signal
 import sys
 import time
 import warnings
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -58,7 +57,7 @@ class Layer(NamedTuple):
 
 @dataclass(frozen=True)
 class Config:
-    """Table 1, and the choices the paper describes or leaves open. The defaults are the paper's training on KITTI."""
+    """Table 1, and the choices the paper leaves open. By default the paper's 500 epochs on KITTI; what is ours says so."""
     #                   r    n_fps  n_n   MLP
     sa1: Layer = Layer(1.0,  1024,    8, (4, 8, 16, 32))
     fe: Layer = Layer(None,  None,   16, (32, 64))
@@ -67,13 +66,13 @@ class Config:
     mpn: Layer = Layer(None, None, None, (64, 256))
     mlp: Layer = Layer(None, None, None, (64, 6))
 
-    spread: int = 8             # which n_n of a ball: spread over the nearest 8 n_n of them; 1: the nearest. Not in the paper
+    spread: int = 8             # which n_n of a ball: in even steps of the nearest 8 n_n; 1: the nearest. Ours, README says why
     epochs: int = 500           # section 4
-    batch: int = 16             # pairs; not in the paper
+    batch: int = 16             # pairs; ours
     lr: float = 1e-3            # Adam's default; the peak of the one-cycle schedule
-    schedule: str = "steps"     # "steps": x0.1 at 3/5 and 4/5 of the epochs, 300 and 400 of 500; "one-cycle": annealed to nothing
-    swap: str = "both"          # "both" directions of every pair in a batch, or at "random" one of them (section 4)
-    augment: bool = False       # mirror pairs and move Q by small random motions: not in the paper
+    schedule: str = "steps"     # x0.1 (ours) at 3/5 and 4/5 of the epochs, 300 and 400 of 500; "one-cycle": torch's OneCycleLR
+    swap: str = "both"          # ours: "both" directions of every pair in a batch; "random": one of them, as in section 4
+    augment: bool = False       # ours: mirror pairs and move Q by small random motions
 
     def __post_init__(self):
         for name in ("sa1", "fe", "sa2", "sa3", "mpn", "mlp"):     # json turns tuples into lists; turn them back
@@ -81,13 +80,17 @@ class Config:
             if len(mlp) < 2:
                 raise ValueError(f"Config.{name}: its MLP has {len(mlp)} layers, at least 2 are needed")
             object.__setattr__(self, name, Layer(r, n_fps, n_n, tuple(mlp)))
+        if not 65536 > self.sa1.n_fps >= self.sa2.n_fps >= self.sa3.n_fps > 0:
+            raise ValueError("Config: n_fps of sa1, sa2, sa3 must not grow, and stay below 65,536")
+        if len(self.mlp.mlp) != 2 or self.schedule not in ("steps", "one-cycle") or self.swap not in ("both", "random"):
+            raise ValueError("Config: mlp has two layers, schedule is 'steps' or 'one-cycle', swap is 'both' or 'random'")
 
     def as_dict(self):
         """Plain lists and numbers, which json and torch.load(weights_only=True) give back; Config(**d) is the inverse."""
         return json.loads(json.dumps(asdict(self)))
 
 
-SHORT = dict(epochs=9, batch=8, lr=1e-2, schedule="one-cycle", augment=True)      # the 15-minute training on the simulated city
+SHORT = dict(epochs=11, batch=8, lr=2e-2, schedule="one-cycle", augment=True)      # the 15-minute training on the simulated city
 
 
 # ------------------------------------------------------------------------------------ sections 3.1, 3.2: problem and objective
@@ -107,20 +110,24 @@ def loss_unweighted(y_hat, y):
 
 # ----------------------------------------------------------------------- sections 3.3.2, 3.3.3: sampling and grouping (NumPy)
 
+RUN = 192       # points that are neighbours in the tree; 128 to 256 are as fast
+
+
 def farthest_point_sampling(xyz, n, start=0, tree=None):
     """Exact farthest point sampling: (N,3) -> (n,) int64 indices. Each pick is the point farthest from all picks before it.
 
-    Ties go to the lowest index. Nested: the first m picks are what n = m gives. `tree`, a cKDTree of xyz, saves building one:
-    the order of its leaves cuts the cloud into runs of neighbours, and a pick can only bring nearer the points of runs whose
-    bounding box is nearer to it than the run's farthest point is to the picks so far. All other runs are left alone.
-    ValueError when there are fewer than n points.
+    Ties go to the lowest index (so picks repeat when fewer than n points differ). Nested: the first m picks are what n = m gives.
+    `tree`, a cKDTree of xyz, saves building one: the order of its leaves cuts the cloud into runs of neighbours, and a pick can
+    only bring nearer the points of runs whose bounding box is nearer to it than the run's farthest point is to the picks so far.
+    All other runs are left alone. ValueError when there are fewer than n points.
     """
+    xyz = np.asarray(xyz)
     if not (0 < n <= len(xyz) and 0 <= start < len(xyz)):
         raise ValueError(f"farthest point sampling of {n} among {len(xyz)} points from {start}: n must be 1 to {len(xyz)}, start below that")
     xyz = np.asarray(xyz, np.float32 if xyz.dtype == np.float32 else np.float64)
     order = (tree or cKDTree(xyz)).indices
-    order = np.pad(order, (0, -len(order) % 192), mode="edge").reshape(-1, 192)                # (runs,192), the last one padded
-    x, y, z = np.ascontiguousarray(xyz[order].transpose(2, 0, 1))                              # each (runs,192)
+    order = np.pad(order, (0, -len(order) % RUN), mode="edge").reshape(-1, RUN)                # (runs,RUN), the last one padded
+    x, y, z = np.ascontiguousarray(xyz[order].transpose(2, 0, 1))                              # each (runs,RUN)
     low, high = (np.stack([f(c, axis=1) for c in (x, y, z)]) for f in (np.min, np.max))        # (3,runs) boxes
     nearest = np.full(order.shape, np.inf, x.dtype)         # squared distance of each point to the picks so far
     farthest = nearest[:, 0].copy()                         # the largest of each run
@@ -148,17 +155,19 @@ def group_ball(xyz, centroids, r, n_n, tree=None, spread=1):
     included: the nearest n_n, or with spread > 1 n_n in even steps, from first to last, of the nearest spread * n_n.
 
     The first is the centroid (or a point in the same place). Where there are fewer, the missing slots hold the centroid's own
-    index (section 3.3.2), which changes no maximum. `tree`, a cKDTree of xyz, saves building one.
+    index (section 3.3.2). That changes no maximum, though it counts in BatchNorm's statistics, and it is the rule: on real scans
+    a third of SA1's balls have fewer than 8 points. `tree` as above.
     """
+    # ranks as a list: for the number 1 scipy would drop the axis
     _, idx = (tree or cKDTree(xyz)).query(xyz[centroids], [*range(1, spread * n_n + 1)], distance_upper_bound=np.nextafter(r, np.inf))
     size = (idx < len(xyz)).sum(1, keepdims=True)                                              # (S,1); scipy marks a missing one by N
     rank = np.rint(np.arange(n_n) * np.maximum((size - 1) / max(n_n - 1, 1), 1)).astype(int)   # (S,n_n): 0, 1, 2 ... when all fit
     return np.where(rank < size, np.take_along_axis(idx, rank, 1), centroids[:, None])
 
 
-def group_knn(query, xyz, k):
-    """The neighbours of the flow embedding (section 3.3.3): (S,3), (N,3) -> (S,k) indices of the k points nearest to each query
-    point; with fewer than k points the nearest is repeated."""
+def group_knn(xyz, query, k):
+    """The neighbours of the flow embedding (section 3.3.3): (N,3) points, (S,3) -> (S,k) indices of the k points nearest to each
+    query point; with fewer than k points the nearest is repeated."""
     _, idx = cKDTree(xyz).query(query, [*range(1, k + 1)])
     return np.where(idx == len(xyz), idx[:, :1], idx)
 
@@ -171,6 +180,9 @@ def geometry_dtype(config):
                      ("idx2", "u2", (n2, k2)),          # neighbours in SA2, of SA1's centroids
                      ("idx3", "u2", (n3, k3)),          # neighbours in SA3, of SA2's
                      ("dropped", "i4")])                # NaN or infinite points left out
+
+
+GEOMETRY = 1    # raise when scan_geometry changes, so that older caches are not read
 
 
 def scan_geometry(scan, config=Config()):
@@ -219,20 +231,21 @@ def _geometry_of_file(path, config):
 def load_geometry(sequences, config, cache="cache"):
     """List of `Sequence` -> list of (n,) arrays of records, memory-mapped from files that are made where there are none yet.
 
-    The name of a file holds all it depends on, so a stale one is never read; it is moved into place when complete, so that two
-    runs may share a cache. Any core works on one scan at a time. ValueError for a scan with too few points.
+    A file's name is a digest of the data and settings it depends on, so a stale one is never read, and it is moved into place
+    when complete, so two runs may share a cache. Scans are shared out over the cores. ValueError for a scan with too few points.
     """
     dtype = geometry_dtype(config)
     files = []
     for s in sequences:
-        depends = (fingerprint(s), [p.stat().st_mtime_ns for p in s.scan_paths], dtype.descr, config.sa1.r, config.sa2.r,
+        depends = (GEOMETRY, fingerprint(s), [p.stat().st_mtime_ns for p in s.scan_paths], dtype.descr, config.sa1.r, config.sa2.r,
                    config.sa3.r, config.spread, MAX_RANGE)
         files.append(Path(cache) / f"{s.name}-{hashlib.sha256(repr(depends).encode()).hexdigest()[:16]}.npy")
     missing = [(s, file) for s, file in zip(sequences, files) if not file.is_file()]
     if missing:
         paths = [path for s, _ in missing for path in s.scan_paths]
-        with multiprocessing.Pool(os.cpu_count(), signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
-            records = pool.imap(partial(_geometry_of_file, config=config), paths, chunksize=4)
+        pool = ProcessPoolExecutor(kitti.cores(), initializer=kitti.worker_starts)
+        try:
+            records = pool.map(partial(_geometry_of_file, config=config), paths, chunksize=4)
             records = progress(records, len(paths), "sampling and grouping, scans")
             for s, file in missing:
                 with metrics.replacing(file) as temporary:
@@ -241,6 +254,8 @@ def load_geometry(sequences, config, cache="cache"):
                         out[i] = next(records)
                     out.flush()
             next(records, None)                         # lets the progress line end
+        finally:
+            pool.shutdown(cancel_futures=True)
     geometry = [np.load(file, mmap_mode="r") for file in files]
     for s, records in zip(sequences, geometry):
         if records["dropped"].any():
@@ -262,7 +277,7 @@ class Batch(NamedTuple):
 
 def make_batch(clouds, p, q, config, device="cpu"):
     """(C,) records, (B,) and (B,) indices of them -> Batch on `device`. The one thing computed here is what depends on a pair."""
-    idx_fe = np.stack([group_knn(clouds["xyz"][i], clouds["xyz"][j], config.fe.n_n) for i, j in zip(p, q)])
+    idx_fe = np.stack([group_knn(clouds["xyz"][j], clouds["xyz"][i], config.fe.n_n) for i, j in zip(p, q)])
     arrays = (clouds["xyz"], clouds["group"], clouds["idx2"].astype(np.int64), clouds["idx3"].astype(np.int64), p, q, idx_fe)
     return Batch(*(torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in arrays))
 
@@ -270,7 +285,8 @@ def make_batch(clouds, p, q, config, device="cpu"):
 # --------------------------------------------------------------------------------------------- section 3.3: the network (torch)
 
 class GatherAdd(torch.autograd.Function):
-    """u (B,n,D), v (B,S,D), idx (B,S,k) -> z_ij = u_{idx_ij} + v_i (B,S,k,D)."""
+    """u (B,n,D), v (B,S,D), idx (B,S,k) -> u[b, idx] + v[:, :, None] (B,S,k,D), written out because torch's own backward of
+    indexing is slow on a CPU."""
 
     @staticmethod
     def forward(ctx, u, v, idx):
@@ -290,8 +306,8 @@ class GatherAdd(torch.autograd.Function):
 class LinearMax(torch.autograd.Function):
     """h (B,S,k,D), W (D',D) -> max over k of h W^T (B,S,D'), and E[h] (D,) and E[h^T h] (D,D) over all B*S*k rows.
 
-    Pair by pair, and once more on the way back, so that the largest tensors of the network, (B,S,k,D') and its gradient, never
-    exist in full: memory traffic is what a CPU waits for. Equal maxima share the gradient, as in torch.amax."""
+    One element of the batch at a time, and again on the way back, so that the largest tensors of the network, (B,S,k,D') and its
+    gradient, never exist in full: memory traffic is what a CPU waits for. Equal maxima share the gradient, as in torch.amax."""
 
     @staticmethod
     def forward(ctx, h, W):
@@ -312,11 +328,11 @@ class LinearMax(torch.autograd.Function):
         B, S, k, D = h.shape
         grad_h, grad_W, z = torch.empty_like(h), torch.zeros_like(W), h.new_empty(S * k, len(W))
         constant, slope = grad_first / (B * S * k), (grad_second + grad_second.t()) / (B * S * k)
-        is_max = z.view(S, k, -1)
+        is_max = z.view(S, k, -1)                       # in z's memory: first 0 and 1, then the gradient
         for b, rows in enumerate(h.reshape(B, S * k, D)):
             torch.mm(rows, W.t(), out=z)
             torch.eq(is_max, out[b][:, None], out=is_max)
-            is_max.mul_((grad[b] / is_max.sum(1).clamp_(min=1))[:, None])                      # now the gradient of z
+            is_max.mul_((grad[b] / is_max.sum(1).clamp_(min=1))[:, None])
             grad_W.addmm_(z.t(), rows)
             torch.addmm(constant, rows, slope, out=grad_h[b].view(S * k, D)).addmm_(z, W)
         return grad_h, grad_W
@@ -330,8 +346,8 @@ def norm_relu(norm, z):
 def linear_norm_relu_max(linear, norm, h):
     """max over k of ReLU(BN(linear(h))): (B,S,k,D) -> (B,S,D').
 
-    ReLU and BN are monotone in each channel, so the maximum is taken first: of z where BN's scale is positive, of -z where it is
-    negative. BN's statistics are still those of all neighbours; they follow from h's: mean = W E[h] + b, var = diag(W Cov[h] W^T).
+    ReLU is increasing and BN increasing or decreasing with the sign of its scale, so the maximum is taken first: of z where that
+    is positive, of -z where it is negative. BN's statistics are still those of all neighbours; they follow from h's: mean = W E[h] + b, var = diag(W Cov[h] W^T).
     """
     sign = torch.where(norm.weight < 0, -1.0, 1.0)
     W, b = sign[:, None] * linear.weight, sign * linear.bias
@@ -352,7 +368,7 @@ def linear_norm_relu_max(linear, norm, h):
 
 class MiniPointNet(nn.Module):
     """Section 3.3.1: an MLP shared by all points, h: R^D -> R^D', then the element-wise maximum over them. Every layer is linear,
-    batch normalisation, ReLU. It is the core of SA and FE too, which give the first linear layer's output: see there."""
+    batch normalisation, ReLU. It is the core of SA and FE too. The caller applies linears[0], which SA and FE split."""
 
     def __init__(self, d_in, widths):
         super().__init__()
@@ -433,7 +449,7 @@ class D3DLO(nn.Module):
 
 
 def load_weights(path=None, device="cpu"):
-    """Weights file or run folder (None: those beside this file) -> (D3DLO in eval mode, what else the file says as a dict).
+    """Weights file or run folder (None: those beside this file) -> (D3DLO in eval mode, the file's dict).
     The network is rebuilt from the file itself. FileNotFoundError, ValueError."""
     path = Path(path or WEIGHTS)
     path = path / "weights.pt" if path.is_dir() else path
@@ -443,7 +459,7 @@ def load_weights(path=None, device="cpu"):
         state = torch.load(path, map_location=device, weights_only=True)
         net = D3DLO(Config(**state["config"])).to(device)
         net.load_state_dict(state["model"])
-        state["step"], state["train"], from_vector(state["mean_motion"])
+        state["step"], state["train"], from_vector(state["mean_motion"])       # a KeyError when one is missing
     except Exception as error:      # torch and pickle raise many kinds; to the user they are one
         reason = f"{type(error).__name__}: {error}".splitlines()[-1].strip()
         raise ValueError(f"{path}: no weights of D3DLO ({reason:.120}); give a weights.pt or a run folder") from None
@@ -484,7 +500,8 @@ class Odometry:
 
 
 def relative_pose(scan_p, scan_q, weights=None):
-    """Two scans (N,4) -> T_pq (4,4) float64, which maps points of Q into P's frame (section 3.1). As in `Odometry`."""
+    """Two scans (N,4) -> T_pq (4,4) float64, which maps points of Q into P's frame (section 3.1). As in `Odometry`, which serves
+    better for many pairs: the weights are loaded at each call."""
     odometry = Odometry(weights)
     odometry.register(scan_p)
     return odometry.register(scan_q)
@@ -502,7 +519,7 @@ def augment(clouds, T_pq, rng):
     clouds["xyz"][..., 1] *= sign[:, None]
     clouds["group"][..., 1] *= sign[:, None, None]
     M = np.where(mirrored[:, None, None], np.diag([1.0, -1, 1, 1]), np.eye(4))
-    A = from_vector(rng.normal(size=(n, 6)) * [0.25, 0.1, 0.03, 0.1, 0.1, 1.0])                # m, degrees
+    A = from_vector(rng.normal(size=(n, 6)) * [0.25, 0.1, 0.03, 0.1, 0.1, 1.0])   # sigmas in m, degrees
     R, t = A[:, :3, :3].astype(np.float32), A[:, :3, 3].astype(np.float32)
     clouds["xyz"][n:] = clouds["xyz"][n:] @ R.transpose(0, 2, 1) + t[:, None]
     clouds["group"][n:, ..., :3] = clouds["group"][n:, ..., :3] @ R.transpose(0, 2, 1)[:, None]
@@ -515,19 +532,18 @@ def training_batch(geometry, motions, pairs, config, rng, device="cpu"):
     T_pq = np.stack([motions[s][i] for s, i in pairs])                                         # (n,4,4)
     if config.augment:
         T_pq = augment(clouds, T_pq, rng)
-    n = np.arange(len(pairs))
-    forward, p, q, T = np.ones(len(n), bool), n, n + len(n), T_pq
+    p, q, T = np.arange(len(pairs)), np.arange(len(pairs)) + len(pairs), T_pq
     if config.swap == "both":
         p, q, T = np.concatenate([p, q]), np.concatenate([q, p]), np.concatenate([T, invert(T)])
     else:                                                                                      # the paper's coin
-        forward = rng.random(len(n)) < 0.5
+        forward = rng.random(len(pairs)) < 0.5
         p, q, T = np.where(forward, p, q), np.where(forward, q, p), np.where(forward[:, None, None], T, invert(T))
     target = torch.from_numpy(to_vector(T).astype(np.float32)).to(device)
     return make_batch(clouds, p, q, config, device), target
 
 
 def batches(geometry, motions, config, seed, start, stop, device="cpu"):
-    """Yields training batches number `start` to `stop`, made one ahead in a thread. Each depends on `seed` (a tuple) and its number
+    """Yields training batches number `start` to `stop` (excluded), made one ahead in a thread. Each depends on `seed` (a tuple) and its number
     alone, so a training goes on after an interruption as if there had been none."""
     pairs = np.array([(s, i) for s, T in enumerate(motions) for i in range(len(T))])
     per_epoch = steps_per_epoch(motions, config)
@@ -536,7 +552,8 @@ def batches(geometry, motions, config, seed, start, stop, device="cpu"):
         epoch, part = divmod(step, per_epoch)
         order = np.random.default_rng([*seed, epoch]).permutation(len(pairs))
         chosen = np.array_split(order, per_epoch)[part]     # nearly equal parts: BatchNorm wants no small batch
-        return training_batch(geometry, motions, pairs[chosen], config, np.random.default_rng([*seed, epoch, part + 1]), device)
+        rng = np.random.default_rng([*seed, epoch, part + 1])   # + 1: NumPy takes a trailing 0 for nothing
+        return training_batch(geometry, motions, pairs[chosen], config, rng, device)
 
     with ThreadPoolExecutor(1) as pool:
         ahead = pool.submit(make, start)
@@ -578,9 +595,9 @@ def save(path, **state):
 
 
 def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=print, **remember):
-    """Train `net` by its config: Adam, eq. 2. Every five minutes writes RUN/checkpoint.pt, whose content `resume` goes on from,
+    """Train `net` by its config: Adam, eq. 2. Every five minutes and at the end writes RUN/checkpoint.pt, whose content `resume` goes on from,
     and RUN/weights.pt, for use: with BatchNorm's statistics recomputed. `remember` is stored in both. Returns the usable net."""
-    config, per_epoch = net.config, steps_per_epoch(motions, net.config)
+    config, per_epoch, run = net.config, steps_per_epoch(motions, net.config), Path(run)
     total = config.epochs * per_epoch
     optimizer = torch.optim.Adam(net.parameters(), lr=config.lr)
     if config.schedule == "one-cycle":
@@ -637,6 +654,7 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu")
     Beside the network stand two trivial predictors: standing still, and the mean motion of the training set. Rows whose data
     the weights were trained on are marked, by the data's fingerprint and not by name.
     """
+    out = Path(out)
     constant = {"standing still": np.eye(4), "mean motion of training": from_vector(state["mean_motion"])}
     scores = {predictor: {} for predictor in ("network", *constant)}      # predictor -> sequence -> segment and step errors
     for s, records in progress(zip(sequences, geometry), len(sequences), "registering, sequences"):
@@ -649,7 +667,7 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu")
                 metrics.write_poses(out / f"{s.name}.txt", poses_cam)
             if s.poses is not None:
                 scores[predictor][s.name] = metrics.segment_errors(s.poses_cam, poses_cam), metrics.step_errors(s.poses, poses)
-    known = {s.name: state["train"].get(s.name) == fingerprint(s) for s in sequences}
+    known = {s.name: fingerprint(s) in state["train"].values() for s in sequences}
 
     def summary(names, predictor="network"):
         pooled = [scores[predictor][name] for name in names if name in scores[predictor]]
@@ -679,27 +697,28 @@ def train(data=None, sequences=None, out=None, epochs=None, batch=None, seed=0, 
     validation splits beside them. Returns the run folder. ValueError, FileNotFoundError."""
     check_device(device)
     run = Path(out or time.strftime("runs/%Y-%m-%d-%H%M%S"))
-    if (run / "checkpoint.pt").exists() and not resume:
+    if (run / "config.json").exists() and not resume:
         raise ValueError(f"{run}: holds a training already; add --resume to go on with it, or choose another --out")
     config = Config(**(SHORT if short or not data else {}))
     config = replace(config, epochs=epochs or config.epochs, batch=batch or config.batch)
+    if resume:
+        config, data, sequences, seed = begun_with(run)
     root = Path(data) if data else kitti.simulate(SIMULATED)
     there = [s.name for s in kitti.open_sequences(root)]
     chosen = kitti.open_sequences(root, sequences or ("train" if set(SPLITS["train"]) & set(there) else "all"))
-    names = [s.name for s in chosen]
-    for s in chosen:
-        if s.poses is None or len(s) < 2:
-            raise ValueError(f"{root}/poses/{s.name}.txt: no such file, or only one scan; sequence {s.name} is nothing to train on")
+    names, motions = [s.name for s in chosen], [s.motions() for s in chosen]
+    if not sum(map(len, motions)):
+        raise ValueError(f"{root}: sequence {' '.join(names)} has a single scan; training needs pairs")
     held_out = kitti.open_sequences(root, [n for n in SPLITS["test"] + SPLITS["validation"] if n in there and n not in names])
     remember = {"train": {s.name: fingerprint(s) for s in chosen},
-                "mean_motion": to_vector(np.concatenate([s.motions() for s in chosen])).mean(0).tolist()}
-    state = load_weights(run / "checkpoint.pt", device)[1] if resume else None
+                "mean_motion": to_vector(np.concatenate(motions)).mean(0).tolist()}
+    state = load_weights(run / "checkpoint.pt", device)[1] if resume and (run / "checkpoint.pt").exists() else None
     if state and state["train"] != remember["train"]:
         raise ValueError(f"{run}/checkpoint.pt: was trained on other data than lies there now; resume with the data it was begun with")
     geometry = load_geometry(chosen + held_out, config)
 
     run.mkdir(parents=True, exist_ok=True)
-    arguments = dict(data=data, sequences=names, epochs=epochs, batch=batch, seed=seed, device=device, short=short)
+    arguments = dict(data=data, sequences=names, seed=seed, device=device)
     versions = {"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__, "torch": torch.__version__}
     with metrics.replacing(run / "config.json") as temporary:
         temporary.write_text(json.dumps(dict(arguments=arguments, config=config.as_dict(), versions=versions), indent=1) + "\n")
@@ -710,7 +729,7 @@ def train(data=None, sequences=None, out=None, epochs=None, batch=None, seed=0, 
             log.write(line + "\n")
 
     torch.manual_seed(seed)
-    net, motions = D3DLO(config).to(device), [s.motions() for s in chosen]
+    net = D3DLO(config).to(device)
     say(f"{sum(p.numel() for p in net.parameters()):,} parameters, {sum(map(len, motions)):,} pairs of scans, {config.epochs} epochs of "
         f"{steps_per_epoch(motions, config)} batches -> {run}")
     net = fit(net, geometry[:len(chosen)], motions, run, seed, device, state, say, **remember)
@@ -729,6 +748,9 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu"):
     out = Path(out or time.strftime("results/%Y-%m-%d-%H%M%S"))
     root = Path(data) if data else kitti.simulate(SIMULATED, sequences=SPLITS["test"] + SPLITS["validation"])
     chosen = kitti.open_sequences(root, sequences or ("all" if data else ("test", "validation")))
+    for s in chosen:
+        if s.poses is None and (s.folder / "poses.txt").exists():
+            print(f"{s.folder}/poses.txt: SemanticKITTI's, estimated by SuMa; not used, it is no ground truth", file=sys.stderr)
     source = {"weights": str(weights or WEIGHTS), "data": str(root)}
     print(evaluate_network(net, state, chosen, load_geometry(chosen, net.config), out, source, device))
     return out
@@ -743,7 +765,7 @@ def check_device(device):
 
 def keep_freed_memory():
     """Where the C library is glibc, let it keep large freed blocks. It would hand them back to the system and page-fault them in
-    again at the next allocation, which is half the time of a training step."""
+    again at the next allocation, which is a third of the time of a training step."""
     try:
         libc = ctypes.CDLL(None)
         libc.mallopt(-4, 0)             # M_MMAP_MAX: large blocks from the heap too
@@ -753,11 +775,12 @@ def keep_freed_memory():
 
 
 def begun_with(run):
-    """The arguments a run was begun with."""
+    """Config, data, sequences and seed a training was begun with, from RUN/config.json."""
     try:
-        return json.loads((Path(run) / "config.json").read_text())["arguments"]
+        begun = json.loads((run / "config.json").read_text(encoding="utf-8"))
+        return Config(**begun["config"]), *(begun["arguments"][name] for name in ("data", "sequences", "seed"))
     except (ValueError, KeyError, TypeError, OSError):
-        raise ValueError(f"{run}/config.json: missing or damaged; --resume needs --out RUN, the folder of the training to go on with") from None
+        raise ValueError(f"{run}/config.json: missing or damaged, so there is no training to go on with; give its folder by --out") from None
 
 
 def positive(text, least=1):
@@ -783,10 +806,10 @@ def main(argv=None):
         p.add_argument("--sequences", nargs="+", metavar="NN", help="names, or splits: train, test, validation, all")
         p.add_argument("--device", default="cpu", help="cpu, cuda or mps (default: cpu)")
     t.add_argument("--out", metavar="RUN", help="folder of the run (default: runs/TIME)")
-    t.add_argument("--epochs", type=positive, metavar="N", help=f"default: {Config.epochs}, on the simulated city {SHORT['epochs']}")
-    t.add_argument("--batch", type=positive, metavar="N", help=f"pairs in a batch, each in both directions (default: {Config.batch})")
+    t.add_argument("--epochs", type=positive, metavar="N", help=f"default: {Config.epochs}, short {SHORT['epochs']}")
+    t.add_argument("--batch", type=positive, metavar="N", help=f"pairs in a batch, each both ways (default: {Config.batch}, short {SHORT['batch']})")
     t.add_argument("--seed", type=lambda text: positive(text, 0), default=0, metavar="N", help="of the first weights, the order of pairs and the augmentation (default: 0)")
-    t.add_argument("--short", action="store_true", help="the simulated city's recipe on --data: annealed learning rate, augmentation")
+    t.add_argument("--short", action="store_true", help="fewer epochs, one-cycle learning rate, augmentation (always without --data)")
     t.add_argument("--resume", action="store_true", help="go on with the training in --out, with the options it was begun with")
     e.add_argument("--weights", metavar="FILE|RUN", help="weights, or folder of a run (default: those shipped)")
     e.add_argument("--out", metavar="DIR", help="folder for NN.txt and results.json (default: results/TIME)")
@@ -795,14 +818,14 @@ def main(argv=None):
     try:
         if args.pop("command") == "eval":
             evaluate(**args)
-        elif args["resume"]:
-            train(**begun_with(args["out"]), out=args["out"], resume=True)
         else:
+            if args["resume"] and any(args[k] != t.get_default(k) for k in args.keys() - {"resume", "out", "device"}):
+                raise ValueError("--resume goes on with the options the run was begun with; give only --out RUN, and --device")
             train(**args)
     except KeyboardInterrupt:
-        print("\nd3dlo: interrupted; a training goes on from its last checkpoint with --out RUN --resume", file=sys.stderr)
+        print("\nd3dlo: interrupted; a training goes on from its last checkpoint by train --out RUN --resume", file=sys.stderr)
         return 130
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, BrokenExecutor) as error:
         print(f"d3dlo: {error}", file=sys.stderr)
         return 2
     return 0

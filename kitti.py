@@ -171,7 +171,8 @@ class Sequence:
         """(n-1,4,4) T_{t,t+1} = inv(T_t) @ T_{t+1} (paper eq. 1) in the Velodyne frame: maps points of scan t+1 into scan t.
         Raises ValueError when the sequence has no ground truth."""
         if self.poses is None:
-            raise ValueError(f"Sequence {self.name} has no ground truth: put the official poses/{self.name}.txt beside sequences/.")
+            estimate = "; its poses.txt is SemanticKITTI's, estimated by SuMa, and no ground truth" * (self.folder / "poses.txt").exists()
+            raise ValueError(f"Sequence {self.name} has no ground truth: put the official poses/{self.name}.txt beside sequences/{estimate}.")
         return invert(self.poses[:-1]) @ self.poses[1:]
 
 
@@ -249,7 +250,7 @@ def remove_plane(scan, threshold=0.15, max_tilt=15.0, hypotheses=400, subsample=
 X, Y, YAW, HALF_X, HALF_Y, Z0, Z1, ALBEDO, FUZZ, ROUND = range(10)  # m, radians; FUZZ: depth [m] to which foliage lets light in; ROUND: a cylinder
 CITY = 1  # raise when the city changes, so that scans of two versions are never mixed
 ELEVATION = np.radians(np.r_[np.linspace(-24.33, -8.83, 32), np.linspace(-8.33, 2.0, 32)])  # the HDL-64E's 64 beams, bottom to top
-SENSOR_HEIGHT, MAX_RANGE, MIN_RANGE = 1.73, 80.0, 2.5  # m
+SENSOR_HEIGHT, MIN_RANGE, CITY_RANGE = 1.73, 2.5, 80.0  # m
 LANE = 3.5  # m; we keep to the right lane of two, so the road reaches from 1.75 m right to 5.25 m left of our path
 CELL = 0.5  # m, of the ground's raster
 SCANS = {"train": 320, "test": 170, "validation": 170}  # per sequence: enough for 100 m segments, few enough to make on the spot
@@ -396,7 +397,7 @@ def _roadside(rng, at, length, odds):
 def _ground(rng, at, length):
     """A raster of the ground: height [m] and albedo of every CELL, and the corner (2,) it starts at. Road, kerb, pavement, rough grass."""
     x, y, _ = at(np.arange(0, length, CELL / 2), LANE / 2)
-    corner = np.array([x.min(), y.min()]) - MAX_RANGE - 5
+    corner = np.array([x.min(), y.min()]) - CITY_RANGE - 5
     i, j = ((np.stack([x, y]) - corner[:, None]) / CELL).astype(int)
     off = np.ones((i.max() + int(90 / CELL), j.max() + int(90 / CELL)), bool)
     off[i, j] = False
@@ -457,7 +458,7 @@ def _simulate_scan(name, seed, scans, azimuth, i):
 
     # prisms (n,) near enough, and the columns each can meet
     p = np.concatenate([prisms, moving(i)])
-    p = p[np.hypot(p[:, X] - eye[0], p[:, Y] - eye[1]) - np.hypot(p[:, HALF_X], p[:, HALF_Y]) < MAX_RANGE]
+    p = p[np.hypot(p[:, X] - eye[0], p[:, Y] - eye[1]) - np.hypot(p[:, HALF_X], p[:, HALF_Y]) < CITY_RANGE]
     dx, dy, c, s = p[:, X] - eye[0], p[:, Y] - eye[1], np.cos(p[:, YAW]), np.sin(p[:, YAW])
     ox, oy = -(c * dx + s * dy), s * dx - c * dy  # the eye in the prism's frame
     sx, sy = np.array([[1, 1, -1, -1], [1, -1, 1, -1]])[:, None] * p[:, [HALF_X, HALF_Y]].T[:, :, None]  # (n,4) corners
@@ -485,7 +486,7 @@ def _simulate_scan(name, seed, scans, azimuth, i):
     met = (enter < leave) & (enter > 0.5)
     # nothing is seen behind a prism that stops every beam of its column
     full = met & (z0 <= 0.01 - h) & (z1 > enter * top[col]) & (fuzz == 0)
-    wall = np.full(azimuth, MAX_RANGE, f4)
+    wall = np.full(azimuth, CITY_RANGE, f4)
     np.minimum.at(wall, col[full], enter[full])
     seen = met & (enter <= wall[col])
     k, col, enter, leave, facing, z0, z1, fuzz = (v[seen] for v in (k, col, enter, leave, facing, z0, z1, fuzz))
@@ -513,7 +514,7 @@ def _simulate_scan(name, seed, scans, azimuth, i):
     shade[hit], blur[hit] = p[k, ALBEDO].astype(f4)[g], fuzz[g]
     aside = np.abs((a - a0 + np.pi) % (2 * np.pi) - np.pi)  # the lowest beams meet our own bonnet and boot
     own_car = np.where(aside < 0.4, 6, np.where(aside > 2.55, 13, 0)) > np.arange(63, -1, -1)[:, None]
-    low = np.flatnonzero((d == np.inf) & (slope < -h / f4(MAX_RANGE)) & ~own_car.ravel())
+    low = np.flatnonzero((d == np.inf) & (slope < -h / f4(CITY_RANGE)) & ~own_car.ravel())
     m, col = slope[low], low % azimuth
     flat = -h / m
     for _ in range(2):  # where it meets the plane, then where it meets the ground found there
@@ -522,14 +523,14 @@ def _simulate_scan(name, seed, scans, azimuth, i):
     d[low], cosine[low], shade[low] = flat, -sin_w[low], albedo[cell]
 
     # returns: noise, drop-outs, intensity
-    ray = np.flatnonzero(d < MAX_RANGE)
+    ray = np.flatnonzero(d < CITY_RANGE)
     noise = lambda: rng.standard_normal(len(ray), dtype=f4)
     r = d[ray] / cos_w[ray] + 0.02 * noise() + blur[ray] * rng.random(len(ray), dtype=f4)
     cosine, shade = cosine[ray], shade[ray]
     lost = 0.01 + 0.10 * (r / 40) ** 2 * (0.15 / (0.05 + shade)) + 0.3 * np.exp(-cosine / 0.02) + 0.5 * np.exp(-shade / 0.03)
     light = shade * (0.65 + 0.4 * np.sqrt(cosine)) + 0.08 * noise()
     light *= rng.random(len(ray), dtype=f4) > 0.08
-    back = (rng.random(len(ray), dtype=f4) > lost) & (r < MAX_RANGE) & (r > MIN_RANGE)
+    back = (rng.random(len(ray), dtype=f4) > lost) & (r < CITY_RANGE) & (r > MIN_RANGE)
     ray, r, light = ray[back], r[back], light[back]
     flat, col = r * cos_w[ray], ray % azimuth
     x, y, z = flat * cos_a[col], flat * sin_a[col], r * sin_w[ray]  # from the eye, axes of the world
@@ -561,7 +562,13 @@ def progress(items, total, what):
             say("\n")
 
 
-def _worker_starts():
+def cores():
+    """Cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def worker_starts():
+    """For the processes of a pool."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which stops its workers
 
 
@@ -607,8 +614,8 @@ def simulate(root, seed=0, sequences=tuple(f"{i:02d}" for i in range(11)), scans
     temporary = {n: Path(tempfile.mkdtemp(prefix=f".{n}-", dir=root / "sequences")) for n in jobs if not (root / "sequences" / n).exists()}
     tasks = [(folder / "velodyne" / f"{i:06d}.bin", n, jobs[n]["seed"], jobs[n]["scans"], jobs[n]["azimuth"], i)
              for n, folder in temporary.items() for i in range(jobs[n]["scans"])]
-    workers = int(workers or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1))
-    pool = ProcessPoolExecutor(workers, initializer=_worker_starts) if workers > 1 and len(tasks) > 8 else None
+    workers = int(workers or cores())
+    pool = ProcessPoolExecutor(workers, initializer=worker_starts) if workers > 1 and len(tasks) > 8 else None
     try:
         for folder in temporary.values():
             (folder / "velodyne").mkdir()

@@ -68,7 +68,7 @@ def write_poses(path, T):
 def _same_length(T_gt, T_est):
     T_gt, T_est = np.asarray(T_gt, float), np.asarray(T_est, float)
     if T_gt.shape != T_est.shape:
-        raise ValueError(f"{len(T_gt)} true poses but {len(T_est)} estimated ones: both must cover the same scans")
+        raise ValueError(f"true poses {T_gt.shape} but estimated ones {T_est.shape}: both must be (n,4,4) and cover the same scans")
     return T_gt, T_est
 
 
@@ -85,7 +85,7 @@ def path_lengths(T):
 
 
 def segment_errors(T_gt, T_est):
-    """Errors of all KITTI segments of one sequence (paper: S, |theta_ij|, eq. for E_t, E_r; devkit: calcSequenceErrors).
+    """Errors of all KITTI segments of one sequence (paper: eqs. 6 to 8, whose means `kitti_errors` takes; devkit: calcSequenceErrors).
 
     (n,4,4), (n,4,4) -> structured array with fields first, last (frames), length [m], t_err [%], r_err [deg/m].
     A segment starts at every 10th frame and ends at the first frame whose path from there is strictly longer than 100, 200,
@@ -99,8 +99,8 @@ def segment_errors(T_gt, T_est):
     first, last, length = (a[last < len(path)] for a in (first, last, length))
     delta_gt = np.linalg.inv(T_gt[first]) @ T_gt[last]
     delta_est = np.linalg.inv(T_est[first]) @ T_est[last]
-    error = np.linalg.inv(delta_est) @ delta_gt                                     # (segments,4,4)
-    cosine = (np.trace(error[:, :3, :3], axis1=1, axis2=2) - 1) / 2
+    error = np.linalg.inv(delta_est) @ delta_gt     # (segments,4,4); the inverse of the paper's, as in the devkit: same length and angle
+    cosine = (np.trace(error[:, :3, :3], axis1=1, axis2=2) - 1) / 2                 # eq. 6, as the devkit has it; _angle is for steps
     out = np.empty(len(first), SEGMENT)
     out["first"], out["last"], out["length"] = first, last, length
     out["t_err"] = 100 * np.linalg.norm(error[:, :3, 3], axis=1) / length
