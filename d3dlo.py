@@ -90,7 +90,7 @@ class Config:
         return json.loads(json.dumps(asdict(self)))
 
 
-SHORT = dict(epochs=10, batch=8, lr=2e-2, schedule="one-cycle", augment=True)      # the 15-minute training on the simulated city
+SHORT = dict(epochs=9, batch=8, lr=1e-2, schedule="one-cycle", augment=True)      # the 15-minute training on the simulated city
 
 
 # ------------------------------------------------------------------------------------ sections 3.1, 3.2: problem and objective
