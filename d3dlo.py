@@ -565,6 +565,7 @@ def batches(geometry, motions, config, seed, start, stop, device="cpu"):
 
 
 def steps_per_epoch(motions, config):
+    """Batches in which all pairs come once."""
     return math.ceil(sum(map(len, motions)) / config.batch)
 
 
@@ -757,6 +758,7 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu"):
 
 
 def check_device(device):
+    """ValueError when this PyTorch cannot use the device."""
     try:
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError, NotImplementedError) as error:
@@ -784,12 +786,14 @@ def begun_with(run):
 
 
 def positive(text, least=1):
+    """A whole number for argparse."""
     if int(text) < least:
         raise argparse.ArgumentTypeError(f"must be {least} or more")
     return int(text)
 
 
 def main(argv=None):
+    """The command line -> exit code: 0, 2 for bad input, 130 when interrupted."""
     raw = argparse.RawDescriptionHelpFormatter
     paragraphs = __doc__.split("\n\n")
     parser = argparse.ArgumentParser(prog="d3dlo", formatter_class=raw, description=f"{paragraphs[0]}\n\n{paragraphs[-1]}")

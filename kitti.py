@@ -647,6 +647,7 @@ def simulate(root, seed=0, sequences=tuple(f"{i:02d}" for i in range(11)), scans
 
 
 def main(argv=None):
+    """The command line -> exit code."""
     parser = argparse.ArgumentParser(formatter_class=argparse.RawDescriptionHelpFormatter, usage="""
   python kitti.py simulate data/city                        # 11 sequences, 2,620 scans, 4.2 GB
   python kitti.py simulate data/tiny --sequences 00 07 --scans 40 --azimuth 900""",

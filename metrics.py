@@ -168,6 +168,7 @@ def _pairs_of_files(gt, est):
 
 
 def main(argv=None):
+    """The command line -> exit code."""
     parser = argparse.ArgumentParser(
         description="KITTI's odometry errors of trajectories.\n\n  python metrics.py poses/00.txt results/00.txt\n"
         "  python metrics.py poses results", formatter_class=argparse.RawDescriptionHelpFormatter)
