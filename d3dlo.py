@@ -9,7 +9,7 @@ Frame: Velodyne, x forward, y left, z up, metres. `T_ab` maps points of frame b 
 a vector [tx, ty, tz] in metres and [roll, pitch, yaw] in degrees. Shapes: N points of a scan, S centroids, k neighbours of each,
 B pairs of scans, C clouds (scans) in a batch, D features.
 
-    python d3dlo.py train                       # simulated city, 15 minutes on two CPU cores
+    python d3dlo.py train                       # simulated city, 12 minutes on two CPU cores
     python d3dlo.py train --data ROOT           # KITTI odometry, the paper's schedule
     python d3dlo.py eval --data ROOT            # with the weights beside this file
 """
@@ -155,8 +155,8 @@ def group_ball(xyz, centroids, r, n_n, tree=None, spread=1):
     included: the nearest n_n, or with spread > 1 n_n in even steps, from first to last, of the nearest spread * n_n.
 
     The first is the centroid (or a point in the same place). Where there are fewer, the missing slots hold the centroid's own
-    index (section 3.3.2). That changes no maximum, though it counts in BatchNorm's statistics, and it is the rule: on real scans
-    a third of SA1's balls have fewer than 8 points. `tree` as above.
+    index (section 3.3.2). That changes no maximum, though it counts in BatchNorm's statistics, and it is common: on real scans
+    19 to 37 % of SA1's balls have fewer than 8 points. `tree` as above.
     """
     # ranks as a list: for the number 1 scipy would drop the axis
     _, idx = (tree or cKDTree(xyz)).query(xyz[centroids], [*range(1, spread * n_n + 1)], distance_upper_bound=np.nextafter(r, np.inf))

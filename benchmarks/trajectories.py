@@ -11,6 +11,7 @@ import metrics
 
 
 def main():
+    """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("gt", type=Path, help="folder of true poses NN.txt")
     parser.add_argument("est", type=Path, help="folder of estimated ones")
