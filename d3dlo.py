@@ -827,7 +827,7 @@ def main(argv=None):
                 raise ValueError("--resume goes on with the options the run was begun with; give only --out RUN, and --device")
             train(**args)
     except KeyboardInterrupt:
-        print("\nd3dlo: interrupted; a training goes on from its last checkpoint by train --out RUN --resume", file=sys.stderr)
+        print("\nd3dlo: interrupted; a training that has begun goes on by train --out RUN --resume", file=sys.stderr)
         return 130
     except (ValueError, OSError, BrokenExecutor) as error:
         print(f"d3dlo: {error}", file=sys.stderr)
