@@ -23,6 +23,7 @@ import platform
 import sys
 import time
 import warnings
+import zipfile
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -34,6 +35,7 @@ import scipy
 import torch
 import torch.nn.functional as F
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from torch import nn
 
 import kitti
@@ -67,23 +69,34 @@ class Config:
     mlp: Layer = Layer(None, None, None, (64, 6))
 
     spread: int = 8             # which n_n of a ball: in even steps of the nearest 8 n_n; 1: the nearest. Ours, README says why
+    plane: bool = True          # keep the points of the ground plane, Table 2's "pp"
     epochs: int = 500           # section 4
     batch: int = 16             # pairs; ours
     lr: float = 1e-3            # Adam's default; the peak of the one-cycle schedule
     schedule: str = "steps"     # x0.1 (ours) at 3/5 and 4/5 of the epochs, 300 and 400 of 500; "one-cycle": torch's OneCycleLR
-    swap: str = "both"          # ours: "both" directions of every pair in a batch; "random": one of them, as in section 4
+    swap: str = "both"          # ours: "both" directions of every pair in a batch; "random": one of them, as in section 4; "off": forward
     augment: bool = False       # ours: mirror pairs and move Q by small random motions
+
+    # what the paper tried and left; with a 7 in place of mlp's 6 the rotation is a quaternion (section 3.2)
+    cosine: float = 0.0         # weight of the cosine distance, eq. 5, in the loss
+    cosine_of: str = "motion"   # or "translation", that alone
+    uncertainty: bool = False   # section 3.2: homoscedastic uncertainty weighs translation and rotation
+    scales: tuple = ()          # section 3.3.2: further Layers of SA1 on its centroids, multi-scale grouping; n_fps as in sa1
+    coordinates: bool = False   # not in the paper, but DeepCLR's: the mini-PointNet sees where its 64 points are. 61,482 parameters
 
     def __post_init__(self):
         for name in ("sa1", "fe", "sa2", "sa3", "mpn", "mlp"):     # json turns tuples into lists; turn them back
-            r, n_fps, n_n, mlp = getattr(self, name)
-            if len(mlp) < 2:
-                raise ValueError(f"Config.{name}: its MLP has {len(mlp)} layers, at least 2 are needed")
-            object.__setattr__(self, name, Layer(r, n_fps, n_n, tuple(mlp)))
+            object.__setattr__(self, name, Layer(*getattr(self, name)[:3], tuple(getattr(self, name)[3])))
+        object.__setattr__(self, "scales", tuple(Layer(*layer[:3], tuple(layer[3])) for layer in self.scales))
+        if any(len(layer.mlp) < 2 for layer in (self.sa1, self.fe, self.sa2, self.sa3, self.mpn, *self.scales)):
+            raise ValueError("Config: every MLP needs at least 2 layers")
         if not 65536 > self.sa1.n_fps >= self.sa2.n_fps >= self.sa3.n_fps > 0:
             raise ValueError("Config: n_fps of sa1, sa2, sa3 must not grow, and stay below 65,536")
-        if len(self.mlp.mlp) != 2 or self.schedule not in ("steps", "one-cycle") or self.swap not in ("both", "random"):
-            raise ValueError("Config: mlp has two layers, schedule is 'steps' or 'one-cycle', swap is 'both' or 'random'")
+        if len(self.mlp.mlp) != 2 or self.mlp.mlp[1] not in (6, 7):
+            raise ValueError("Config: mlp has two layers, the last of 6 outputs (Euler angles) or 7 (quaternion)")
+        for name, choices in ("schedule", ("steps", "one-cycle")), ("swap", ("both", "random", "off")), ("cosine_of", ("motion", "translation")):
+            if getattr(self, name) not in choices:
+                raise ValueError(f"Config.{name}: {getattr(self, name)!r} is none of {', '.join(choices)}")
 
     def as_dict(self):
         """Plain lists and numbers, which json and torch.load(weights_only=True) give back; Config(**d) is the inverse."""
@@ -103,9 +116,56 @@ def accumulate(motions):
     return np.stack(poses)
 
 
+def to_output(T, config):
+    """Motions (...,4,4) -> what the network gives for them: (...,6) metres and degrees, or (...,7) metres and a quaternion x y z w."""
+    if config.mlp.mlp[1] == 6:
+        return to_vector(T)
+    return np.concatenate([T[..., :3, 3], Rotation.from_matrix(T[..., :3, :3]).as_quat()], -1)
+
+
+def from_output(y, config):
+    """The inverse of `to_output`."""
+    if config.mlp.mlp[1] == 6:
+        return from_vector(y)
+    T = np.tile(np.eye(4), (*y.shape[:-1], 1, 1))
+    T[..., :3, :3], T[..., :3, 3] = Rotation.from_quat(y[..., 3:]).as_matrix(), y[..., :3]
+    return T
+
+
 def loss_unweighted(y_hat, y):
     """Eq. 2: the mean absolute error over metres and degrees alike. (B,6), (B,6) -> ()."""
     return (y - y_hat).abs().mean()
+
+
+def cosine_distance(y_hat, y):
+    """Eq. 5, the mean over a batch: (B,D), (B,D) -> (). The small number gives standing still a value (1) and a gradient."""
+    return (1 - (y * y_hat).sum(1) * torch.rsqrt((y.square().sum(1) + 1e-6) * (y_hat.square().sum(1) + 1e-6))).mean()
+
+
+class Objective(nn.Module):
+    """Eq. 2, and what the paper tried beside it; see Config. Learned weights, if any, are parameters of this and not of the network."""
+
+    def __init__(self, config):
+        super().__init__()
+        self.config = config
+        if config.uncertainty:
+            self.log_variance = nn.Parameter(torch.zeros(2))                                   # of translation, rotation
+
+    def forward(self, y_hat, y):
+        """(B,6), (B,6) -> (); or (B,7), where q and -q are the same rotation."""
+        config = self.config
+        if y.shape[1] == 7:
+            sign = torch.where((y[:, 3:] * y_hat[:, 3:]).sum(1, keepdim=True) < 0, -1.0, 1.0)
+            y = torch.cat([y[:, :3], sign * y[:, 3:]], 1)
+        if config.uncertainty:
+            parts = torch.stack([loss_unweighted(y_hat[:, part], y[:, part]) for part in (slice(3), slice(3, None))])
+            loss = (torch.exp(-self.log_variance) * parts + self.log_variance).sum()           # Kendall and Cipolla 2017, eq. 7
+        else:
+            loss = loss_unweighted(y_hat, y)
+        if config.cosine:
+            n = 3 if config.cosine_of == "translation" else y.shape[1]
+            loss = loss + config.cosine * cosine_distance(y_hat[:, :n], y[:, :n])
+        return loss
 
 
 # ----------------------------------------------------------------------- sections 3.3.2, 3.3.3: sampling and grouping (NumPy)
@@ -187,9 +247,15 @@ def geometry_dtype(config):
     (_, n1, k1, _), (_, n2, k2, _), (_, n3, k3, _) = config.sa1, config.sa2, config.sa3
     return np.dtype([("xyz", "f4", (n1, 3)),            # centroids of SA1, of which the first n2 and n3 are those of SA2 and SA3
                      ("group", "f4", (n1, k1, 4)),      # their neighbours: offset [m] and intensity
+                     *((f"group{i}", "f4", (n1, scale.n_n, 4)) for i, scale in enumerate(config.scales)),
                      ("idx2", "u2", (n2, k2)),          # neighbours in SA2, of SA1's centroids
                      ("idx3", "u2", (n3, k3)),          # neighbours in SA3, of SA2's
                      ("dropped", "i4")])                # NaN or infinite points left out
+
+
+def groups(config):
+    """The names of a record's groups, one for each scale of SA1."""
+    return ["group", *(f"group{i}" for i in range(len(config.scales)))]
 
 
 GEOMETRY = 2    # raise when scan_geometry changes, so that older caches are not read
@@ -205,7 +271,9 @@ def scan_geometry(scan, config=Config()):
     with np.errstate(over="ignore", invalid="ignore"):
         finite = np.isfinite(x + y + z + intensity)
         scan = np.ascontiguousarray(scan[finite & (x * x + y * y + z * z < MAX_RANGE ** 2)], np.float32)
-    (r1, n1, k1, _), (r2, n2, k2, _), (r3, n3, k3, _) = config.sa1, config.sa2, config.sa3
+    if not config.plane:
+        scan = kitti.remove_plane(scan)
+    n1, (r2, n2, k2, _), (r3, n3, k3, _) = config.sa1.n_fps, config.sa2, config.sa3
     if len(scan) < n1:
         raise ValueError(f"{len(scan)} usable points (finite, nearer than {MAX_RANGE:.0f} m), at least {n1} are needed")
     cloud = np.ascontiguousarray(scan[:, :3])
@@ -214,9 +282,10 @@ def scan_geometry(scan, config=Config()):
         centroids = farthest_point_sampling(cloud, n1)
     out = np.empty((), geometry_dtype(config))
     out["xyz"] = xyz = cloud[centroids]                                                        # (n1,3)
-    group = scan[group_ball(cloud, centroids, r1, k1, tree.result(), config.spread)]                    # (n1,k1,4)
-    group[..., :3] -= xyz[:, None]
-    out["group"] = group
+    for name, scale in zip(groups(config), (config.sa1, *config.scales)):
+        group = scan[group_ball(cloud, centroids, scale.r, scale.n_n, tree.result(), config.spread)]   # (n1,k1,4)
+        group[..., :3] -= xyz[:, None]
+        out[name] = group
     out["idx2"] = group_ball(xyz, np.arange(n2), r2, k2, spread=config.spread)
     out["idx3"] = group_ball(xyz[:n2], np.arange(n3), r3, k3, spread=config.spread)
     out["dropped"] = (~finite).sum()
@@ -249,7 +318,7 @@ def load_geometry(sequences, config, cache="cache"):
     files = []
     for s in sequences:
         depends = (GEOMETRY, fingerprint(s), [p.stat().st_mtime_ns for p in s.scan_paths], dtype.descr, config.sa1.r, config.sa2.r,
-                   config.sa3.r, config.spread, MAX_RANGE)
+                   config.sa3.r, [scale.r for scale in config.scales], config.spread, config.plane, MAX_RANGE)
         files.append(Path(cache) / f"{s.name}-{hashlib.sha256(repr(depends).encode()).hexdigest()[:16]}.npy")
     missing = [(s, file) for s, file in zip(sequences, files) if not file.is_file()]
     if missing:
@@ -278,7 +347,7 @@ def load_geometry(sequences, config, cache="cache"):
 class Batch(NamedTuple):
     """C clouds and B pairs (p, q) of them, as tensors."""
     xyz: torch.Tensor       # (C,n1,3)
-    group: torch.Tensor     # (C,n1,k1,4)
+    group: tuple            # of tensors (C,n1,k1,4), one for each scale of SA1
     idx2: torch.Tensor      # (C,n2,k2)
     idx3: torch.Tensor      # (C,n3,k3)
     p: torch.Tensor         # (B,) the cloud that is P
@@ -289,8 +358,11 @@ class Batch(NamedTuple):
 def make_batch(clouds, p, q, config, device="cpu"):
     """(C,) records, (B,) and (B,) indices of them -> Batch on `device`. The one thing computed here is what depends on a pair."""
     idx_fe = np.stack([group_knn(clouds["xyz"][j], clouds["xyz"][i], config.fe.n_n) for i, j in zip(p, q)])
-    arrays = (clouds["xyz"], clouds["group"], clouds["idx2"].astype(np.int64), clouds["idx3"].astype(np.int64), p, q, idx_fe)
-    return Batch(*(torch.from_numpy(np.ascontiguousarray(a)).to(device) for a in arrays))
+
+    def tensor(array):
+        return torch.from_numpy(np.ascontiguousarray(array)).to(device)
+    return Batch(tensor(clouds["xyz"]), tuple(tensor(clouds[name]) for name in groups(config)), tensor(clouds["idx2"].astype(np.int64)),
+                 tensor(clouds["idx3"].astype(np.int64)), tensor(p), tensor(q), tensor(idx_fe))
 
 
 # --------------------------------------------------------------------------------------------- section 3.3: the network (torch)
@@ -441,24 +513,29 @@ class D3DLO(nn.Module):
         super().__init__()
         self.config = config
         self.sa1 = SetAbstraction(1, config.sa1)                                               # c = 1: intensity
-        self.fe = FlowEmbedding(config.sa1.mlp[-1], config.fe)
+        self.scales = nn.ModuleList(SetAbstraction(1, scale) for scale in config.scales)       # none by default
+        self.fe = FlowEmbedding(sum(scale.mlp[-1] for scale in (config.sa1, *config.scales)), config.fe)
         self.sa2 = SetAbstraction(config.fe.mlp[-1], config.sa2)
         self.sa3 = SetAbstraction(config.sa2.mlp[-1], config.sa3)
-        self.mpn = MiniPointNet(config.sa3.mlp[-1], config.mpn.mlp)
+        self.mpn = MiniPointNet(config.sa3.mlp[-1] + 3 * config.coordinates, config.mpn.mlp)
         hidden, out = config.mlp.mlp
         self.mlp = nn.Sequential(nn.Linear(config.mpn.mlp[-1], hidden), nn.BatchNorm1d(hidden), nn.ReLU(), nn.Linear(hidden, out))
 
     def forward(self, batch):
         """Batch -> (B,6): [tx, ty, tz] m and [roll, pitch, yaw] degrees of T_pq, extrinsic x-y-z (section 3.2)."""
         p, q, (n2, n3) = batch.p, batch.q, (batch.idx2.shape[1], batch.idx3.shape[1])
-        feat = self.sa1.forward_grouped(batch.group)                                           # (C,1024,32)
+        feat = [sa.forward_grouped(group) for sa, group in zip((self.sa1, *self.scales), batch.group)]
+        feat = torch.cat(feat, 2) if self.scales else feat[0]                                  # (C,1024,32)
         feat_p, feat_q = feat.index_select(0, p), feat.index_select(0, q)                      # feat[p] is slow on the way back
         xyz = batch.xyz[p]                                                                     # (B,1024,3)
         flow = self.fe(xyz, feat_p, batch.xyz[q], feat_q, batch.idx_fe)                        # (B,1024,64)
         flow = self.sa2(xyz, flow, batch.idx2[p])                                              # (B,256,64)
         flow = self.sa3(xyz[:, :n2], flow, batch.idx3[p])                                      # (B,64,64)
+        if self.config.coordinates:
+            flow = torch.cat([xyz[:, :n3] / 10, flow], 2)                                      # (B,64,67), in tens of metres
         whole = self.mpn(self.mpn.linears[0](flow)[:, None])[:, 0]                             # (B,256), the maximum over all 64
-        return self.mlp(whole)                                                                 # (B,6)
+        y = self.mlp(whole)                                                                    # (B,6)
+        return y if y.shape[1] == 6 else torch.cat([y[:, :3], F.normalize(y[:, 3:])], 1)
 
 
 def load_weights(path=None, device="cpu"):
@@ -489,7 +566,7 @@ def predict_motions(net, records, device="cpu", batch=16):
         clouds = records[i:i + batch + 1]
         p = np.arange(len(clouds) - 1)
         out.append(net(make_batch(clouds, p, p + 1, net.config, device)).cpu().numpy())
-    return from_vector(np.concatenate([np.empty((0, 6)), *out]))
+    return from_output(np.concatenate(out), net.config) if out else np.empty((0, 4, 4))
 
 
 class Odometry:
@@ -530,17 +607,20 @@ def augment(clouds, T_pq, rng):
     mirrored = rng.random(n) < 0.5
     sign = np.where(np.tile(mirrored, 2), -1, 1).astype(np.float32)
     clouds["xyz"][..., 1] *= sign[:, None]
-    clouds["group"][..., 1] *= sign[:, None, None]
+    names = [name for name in clouds.dtype.names if name.startswith("group")]
+    for name in names:
+        clouds[name][..., 1] *= sign[:, None, None]
     M = np.where(mirrored[:, None, None], np.diag([1.0, -1, 1, 1]), np.eye(4))
     A = from_vector(rng.normal(size=(n, 6)) * [0.25, 0.1, 0.03, 0.1, 0.1, 1.0])   # sigmas in m, degrees
     R, t = A[:, :3, :3].astype(np.float32), A[:, :3, 3].astype(np.float32)
     clouds["xyz"][n:] = clouds["xyz"][n:] @ R.transpose(0, 2, 1) + t[:, None]
-    clouds["group"][n:, ..., :3] = clouds["group"][n:, ..., :3] @ R.transpose(0, 2, 1)[:, None]
+    for name in names:
+        clouds[name][n:, ..., :3] = clouds[name][n:, ..., :3] @ R.transpose(0, 2, 1)[:, None]
     return M @ T_pq @ M @ invert(A)
 
 
 def training_batch(geometry, motions, pairs, config, rng, device="cpu"):
-    """Pairs (n,2) of (sequence, scan) -> Batch and targets (B,6). One direction is (P, Q) with T, the other (Q, P) with T^-1."""
+    """Pairs (n,2) of (sequence, scan) -> Batch and targets (B,6) as of `to_output`. One direction is (P, Q) with T, the other (Q, P) with T^-1."""
     clouds = np.stack([geometry[s][i + d] for d in (0, 1) for s, i in pairs])                  # (2n,): all P, all Q
     T_pq = np.stack([motions[s][i] for s, i in pairs])                                         # (n,4,4)
     if config.augment:
@@ -548,10 +628,10 @@ def training_batch(geometry, motions, pairs, config, rng, device="cpu"):
     p, q, T = np.arange(len(pairs)), np.arange(len(pairs)) + len(pairs), T_pq
     if config.swap == "both":
         p, q, T = np.concatenate([p, q]), np.concatenate([q, p]), np.concatenate([T, invert(T)])
-    else:                                                                                      # the paper's coin
+    elif config.swap == "random":                                                              # the paper's coin
         forward = rng.random(len(pairs)) < 0.5
         p, q, T = np.where(forward, p, q), np.where(forward, q, p), np.where(forward[:, None, None], T, invert(T))
-    target = torch.from_numpy(to_vector(T).astype(np.float32)).to(device)
+    target = torch.from_numpy(to_output(T, config).astype(np.float32)).to(device)
     return make_batch(clouds, p, q, config, device), target
 
 
@@ -582,7 +662,7 @@ def steps_per_epoch(motions, config):
     return math.ceil(sum(map(len, motions)) / config.batch)
 
 
-def recompute_statistics(net, batches):
+def recompute_statistics(net, batches, objective=loss_unweighted):
     """BatchNorm's running averages lag behind the weights; replace them by the plain mean over these batches, weights fixed.
     Returns the mean loss over the batches in training mode."""
     norms = [m for m in net.modules() if isinstance(m, nn.modules.batchnorm._BatchNorm)]
@@ -590,16 +670,16 @@ def recompute_statistics(net, batches):
     for norm in norms:
         norm.reset_running_stats()
         norm.momentum = None
-    loss = mean_loss(net.train(), batches)
+    loss = mean_loss(net.train(), batches, objective)
     for norm, momentum in zip(norms, momenta):
         norm.momentum = momentum
     return loss
 
 
 @torch.no_grad()
-def mean_loss(net, batches):
-    """Mean of eq. 2 over batches, in the mode the network is in."""
-    return float(np.mean([loss_unweighted(net(batch), target).item() for batch, target in batches]))
+def mean_loss(net, batches, objective=loss_unweighted):
+    """Mean of the objective over batches, in the mode the network is in."""
+    return float(np.mean([objective(net(batch), target).item() for batch, target in batches]))
 
 
 def save(path, **state):
@@ -613,12 +693,13 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
     and RUN/weights.pt, for use: with BatchNorm's statistics recomputed. `remember` is stored in both. Returns the usable net."""
     config, per_epoch, run = net.config, steps_per_epoch(motions, net.config), Path(run)
     total = config.epochs * per_epoch
-    optimizer = torch.optim.Adam(net.parameters(), lr=config.lr)
+    objective = Objective(config).to(device)
+    optimizer = torch.optim.Adam([*net.parameters(), *objective.parameters()], lr=config.lr)
     if config.schedule == "one-cycle":
         scheduler = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.lr, total_steps=total)
     else:
         scheduler = torch.optim.lr_scheduler.MultiStepLR(optimizer, [total * 3 // 5, total * 4 // 5], gamma=0.1)
-    parts = {"model": net, "optimizer": optimizer, "scheduler": scheduler}
+    parts = {"model": net, "objective": objective, "optimizer": optimizer, "scheduler": scheduler}
     step, losses = 0, []
     if resume:
         step, losses = resume["step"], resume["losses"]
@@ -633,14 +714,14 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
         save(run / "checkpoint.pt", config=config.as_dict(), step=step, losses=losses, **remember,
              **{name: part.state_dict() for name, part in parts.items()})
         usable.load_state_dict(net.state_dict())
-        loss = recompute_statistics(usable, fixed_batches())
+        loss = recompute_statistics(usable, fixed_batches(), objective)
         save(run / "weights.pt", config=config.as_dict(), step=step, **remember, model=usable.state_dict())
         return loss
 
     stored = time.monotonic()
     todo = batches(geometry, motions, config, (seed,), step, total, device)
     for batch, target in progress(todo, total - step, f"training, batches of {config.batch} pairs, swap: {config.swap}"):
-        loss = loss_unweighted(net.train()(batch), target)
+        loss = objective(net.train()(batch), target)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -649,13 +730,13 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
         step += 1
         losses.append(loss.item())
         if step % per_epoch == 0:
-            say(f"epoch {step // per_epoch}/{config.epochs}: loss {np.mean(losses):.4f} (eq. 2), learning rate {rate:.1e}")
+            say(f"epoch {step // per_epoch}/{config.epochs}: loss {np.mean(losses):.4f}, learning rate {rate:.1e}")
             losses = []
         if time.monotonic() - stored > 300:
             store()
             stored = time.monotonic()
     loss_train = store()
-    loss_eval = mean_loss(usable.eval(), fixed_batches())
+    loss_eval = mean_loss(usable.eval(), fixed_batches(), objective)
     say(f"loss over {min(25, total)} batches, weights fixed: {loss_train:.4f} in train mode, {loss_eval:.4f} in eval mode")
     return usable
 
@@ -693,6 +774,11 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu")
     pooled = {group: {p: summary(names, p) for p in scores} for group, names in groups.items()}
     results = {**source, "sequences": each, "splits": {g: p["network"] for g, p in pooled.items() if g != "all"},
                "pooled": pooled["all"]["network"], "predictors": {c: {g: p[c] for g, p in pooled.items()} for c in constant}}
+    server = [f"{i}.txt" for i in range(11, 22)]                # KITTI's sequences without ground truth
+    if {Path(name).stem for name in server} <= set(known):
+        with metrics.replacing(out / "kitti-server.zip") as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name in server:                                 # in its root, as the devkit's readme wants them
+                archive.write(out / name, name)
     plain = json.loads(json.dumps(results), parse_constant=lambda nan: None)    # JSON has no NaN
     with metrics.replacing(out / "results.json") as temporary:
         temporary.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
@@ -706,15 +792,18 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu")
 
 # ------------------------------------------------------------------------------------------------------------- command line
 
-def train(data=None, sequences=None, out=None, epochs=None, batch=None, seed=0, device="cpu", short=False, resume=False):
+def train(data=None, sequences=None, out=None, epochs=None, batch=None, neighbors=None, plane=True, seed=0, device="cpu", short=False,
+          resume=False, config=None):
     """The command `train`: train on `sequences` of `data` (None: the simulated city), evaluate on what there is of the test and
-    validation splits beside them. Returns the run folder. ValueError, FileNotFoundError."""
+    validation splits beside them. `config` takes the place of the options it holds. Returns the run folder. ValueError, FileNotFoundError."""
     check_device(device)
     run = Path(out or time.strftime("runs/%Y-%m-%d-%H%M%S"))
     if (run / "config.json").exists() and not resume:
         raise ValueError(f"{run}: holds a training already; add --resume to go on with it, or choose another --out")
-    config = Config(**(SHORT if short or not data else {}))
-    config = replace(config, epochs=epochs or config.epochs, batch=batch or config.batch)
+    if not config:
+        config = Config(**(SHORT if short or not data else {}), plane=plane)
+        config = replace(config, epochs=epochs or config.epochs, batch=batch or config.batch,
+                         sa1=config.sa1._replace(n_n=neighbors or config.sa1.n_n))
     if resume:
         config, data, sequences, seed = begun_with(run)
     root = Path(data) if data else kitti.simulate(SIMULATED)
@@ -825,6 +914,8 @@ def main(argv=None):
     t.add_argument("--out", metavar="RUN", help="folder of the run (default: runs/TIME)")
     t.add_argument("--epochs", type=positive, metavar="N", help=f"default: {Config.epochs}, short {SHORT['epochs']}")
     t.add_argument("--batch", type=positive, metavar="N", help=f"pairs in a batch, each both ways (default: {Config.batch}, short {SHORT['batch']})")
+    t.add_argument("--neighbors", type=positive, metavar="N", help=f"n_n of the first set abstraction, Table 2 (default: {Config.sa1.n_n})")
+    t.add_argument("--no-plane", action="store_false", dest="plane", help="leave out the points of the ground plane, Table 2")
     t.add_argument("--seed", type=lambda text: positive(text, 0), default=0, metavar="N", help="of the first weights, the order of pairs and the augmentation (default: 0)")
     t.add_argument("--short", action="store_true", help="fewer epochs, one-cycle learning rate, augmentation (always without --data)")
     t.add_argument("--resume", action="store_true", help="go on with the training in --out, with the options it was begun with")

@@ -1,6 +1,6 @@
 """Properties of D3DLO. Every expectation comes from an independent source: brute force, SciPy, a definition written out, or a closed
 form. Real data are optional: D3DLO_KITTI names a folder in KITTI odometry layout; without it those tests are skipped."""
-import json, math, os, pickle, re, shutil, subprocess, sys, types, warnings
+import json, math, os, pickle, re, shutil, subprocess, sys, types, warnings, zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,6 +27,8 @@ OFFICIAL = HERE / "../shared/kitti/official_poses"
 # every kind of layer, a hundredth of the work
 SMALL = Config(sa1=Layer(2.0, 32, 4, (4, 8, 16)), fe=Layer(None, None, 6, (16, 32)), sa2=Layer(4.0, 16, 8, (32, 32)),
                sa3=Layer(8.0, 8, 4, (32, 32)), mpn=Layer(None, None, None, (32, 64)), mlp=Layer(None, None, None, (32, 6)))
+VARIANTS = {"coordinates": replace(SMALL, coordinates=True), "quaternion": replace(SMALL, mlp=Layer(None, None, None, (32, 7))),
+            "scales": replace(SMALL, scales=(Layer(4.0, None, 3, (6, 10)), Layer(1.0, None, 2, (8, 8))))}
 generator = np.random.default_rng
 
 
@@ -248,7 +250,17 @@ def test_camera_and_velodyne_frames_tell_the_same_story(seed):
 
 def test_table_1_has_61290_parameters():
     count = {name: sum(p.numel() for p in block.parameters() if p.requires_grad) for name, block in D3DLO().named_children()}
+    assert count.pop("scales") == 0
     assert count == {"sa1": 868, "fe": 4480, "sa2": 8768, "sa3": 8768, "mpn": 21440, "mlp": 16966} and sum(count.values()) == 61290
+
+
+@pytest.mark.parametrize("changes, parameters", [
+    (dict(sa1=Layer(1.0, 1024, 128, (4, 8, 16, 32)), plane=False, spread=1, swap="off"), 61290), (dict(cosine=1.0, uncertainty=True), 61290),
+    (dict(coordinates=True), 61482), (dict(mlp=Layer(None, None, None, (64, 7))), 61290 + 65),
+    (dict(scales=(Layer(2.0, None, 16, (4, 8, 16, 32)),)), 61290 + 868 + 2 * 32 * 32)])      # SA1 again, and 64 more inputs of FE's 32
+def test_parameters_of_the_variants(changes, parameters):
+    assert sum(p.numel() for p in D3DLO(Config(**changes)).parameters()) == parameters
+    assert sum(p.numel() for p in d3dlo.Objective(Config(**changes)).parameters()) == 2 * changes.get("uncertainty", 0)
 
 
 def plain(net, b):
@@ -269,24 +281,29 @@ def plain(net, b):
     def take(x, idx):                                   # (B,n,D), (B,S,k) -> (B,S,k,D)
         return x[torch.arange(len(x))[:, None, None], idx]
 
-    feat = h(net.sa1.h, b.group).amax(2)                # SA1, shared: one BatchNorm over the clouds of both sides
+    # SA1, shared: one BatchNorm over the clouds of both sides
+    feat = torch.cat([h(sa.h, group).amax(2) for sa, group in zip((net.sa1, *net.scales), b.group, strict=True)], -1)
     x, f, y, g = b.xyz[b.p], feat[b.p], b.xyz[b.q], feat[b.q]
     y_j, g_j = take(y, b.idx_fe), take(g, b.idx_fe)
     f = h(net.fe.h, torch.cat([y_j - x[:, :, None], f[:, :, None].expand_as(g_j), g_j], -1)).amax(2)            # eq. 4
     for sa, idx in (net.sa2, b.idx2[b.p]), (net.sa3, b.idx3[b.p]):
         centroids = x[:, :idx.shape[1]]
         x, f = centroids, h(sa.h, torch.cat([take(x, idx) - centroids[:, :, None], take(f, idx)], -1)).amax(2)  # eq. 3
+    if net.config.coordinates:
+        f = torch.cat([x / 10, f], -1)
     linear, norm, _, last = net.mlp
-    return F.linear(layer(h(net.mpn, f).amax(1), linear, norm), last.weight, last.bias), statistics
+    y = F.linear(layer(h(net.mpn, f).amax(1), linear, norm), last.weight, last.bias)
+    return torch.cat([y[:, :3], y[:, 3:] / y[:, 3:].norm(dim=1, keepdim=True)], 1) if y.shape[1] == 7 else y, statistics
 
 
-@pytest.mark.parametrize("config", [SMALL, replace(SMALL, swap="random", sa3=Layer(0.1, 8, 4, (32, 32)))])      # with all-fallback balls
+@pytest.mark.parametrize("config", [SMALL, *VARIANTS.values(), replace(SMALL, swap="random", sa3=Layer(0.1, 8, 4, (32, 32)))])      # with all-fallback balls
 @pytest.mark.parametrize("training", [True, False])
 @given(seed=SEED)
 def test_the_network_is_equations_3_and_4(training, config, seed):
     rng = generator(seed)
     net = a_net(rng, config).double().train(training)
-    batch = d3dlo.Batch(*(a.double() if a.is_floating_point() else a for a in a_batch(rng, config)[0]))
+    batch = a_batch(rng, config)[0]
+    batch = batch._replace(xyz=batch.xyz.double(), group=tuple(group.double() for group in batch.group))
     expected, statistics = plain(net, batch)
     got, weights = net(batch), torch.from_numpy(rng.normal(size=expected.shape))
     torch.testing.assert_close(got, expected, rtol=1e-9, atol=1e-9)
@@ -343,9 +360,43 @@ def test_recomputed_statistics_close_the_gap_between_train_and_eval():
     assert abs(loss_eval - loss_train) < 0.02 * loss_train and abs(loss_eval - loss_train) < 0.2 * abs(before - loss_train)
     assert {m.momentum for m in net.modules() if hasattr(m, "running_mean")} == {0.1}       # as it was
     first, norm = net.sa1.h.linears[0], net.sa1.h.norms[0]      # written out: the plain mean over batches of means, of unbiased variances
-    z = [F.linear(b.group, first.weight, first.bias).flatten(0, -2) for b, _ in batches]
+    z = [F.linear(b.group[0], first.weight, first.bias).flatten(0, -2) for b, _ in batches]
     torch.testing.assert_close(norm.running_mean, torch.stack([a.mean(0) for a in z]).mean(0), rtol=1e-3, atol=1e-4)
     torch.testing.assert_close(norm.running_var, torch.stack([a.var(0) for a in z]).mean(0), rtol=1e-3, atol=1e-4)
+
+
+@given(SEED, st.sampled_from(["moving", "standing still", "opposite", "equal", "half standing"]), st.sampled_from([6, 7]), st.booleans(),
+       st.sampled_from([0.0, 0.1, 1.0]), st.sampled_from(["motion", "translation"]))
+def test_every_loss_is_what_it_says_and_has_finite_gradients(seed, kind, width, uncertainty, cosine, cosine_of):
+    rng, config = generator(seed), replace(VARIANTS["quaternion"] if width == 7 else SMALL, uncertainty=uncertainty, cosine=cosine, cosine_of=cosine_of)
+    y = torch.from_numpy(d3dlo.to_output(motion(rng, 0 if kind == "standing still" else (0.5, 0.2, 0.1, 0.5, 0.5, 2.0), n=5), config))
+    y_hat = {"moving": torch.from_numpy(rng.normal(size=(5, width))), "standing still": y * 0, "half standing": y * 0, "opposite": -y, "equal": y}[kind]
+    y_hat = y_hat.clone().requires_grad_()
+    objective = d3dlo.Objective(config).double()
+    weights = [w.data.normal_() for w in objective.parameters()]
+    loss = objective(y_hat, y)
+    if width == 7:                                      # q and -q are one rotation: the nearer of the two counts
+        flip = (y_hat[:, 3:] - y[:, 3:]).norm(dim=1) > (y_hat[:, 3:] + y[:, 3:]).norm(dim=1)
+        y = torch.where(flip[:, None] & (torch.arange(7) > 2), -y, y)
+    expected = F.l1_loss(y_hat, y)
+    if uncertainty:
+        t, r = weights[0]
+        expected = F.l1_loss(y_hat[:, :3], y[:, :3]) / t.exp() + t + F.l1_loss(y_hat[:, 3:], y[:, 3:]) / r.exp() + r
+    if cosine:
+        n = 3 if cosine_of == "translation" else width
+        expected = expected + cosine * (1 - F.cosine_similarity(y_hat[:, :n], y[:, :n])).mean()
+    torch.testing.assert_close(loss, expected, atol=1e-3, rtol=1e-3)            # the small number in eq. 5
+    assert all(grad.isfinite().all() for grad in torch.autograd.grad(loss, [y_hat, *objective.parameters()]))
+
+
+@given(SEED)
+def test_quaternions_and_euler_angles_tell_the_same_motion(seed):
+    T = motion(generator(seed), (2, 1, 1, 60, 30, 60), n=4)
+    for config, width in (SMALL, 6), (VARIANTS["quaternion"], 7):
+        y = d3dlo.to_output(T, config)
+        assert y.shape == (4, width)
+        assert_allclose(d3dlo.from_output(y, config), T, atol=1e-9)
+    assert_allclose(d3dlo.from_output(y * ([1] * 3 + [-1] * 4), config), T, atol=1e-9)
 
 
 # -------------------------------------------------------------------------------------------------------------- training
@@ -363,7 +414,7 @@ def test_sixteen_pairs_can_be_learned_by_heart(tmp_path):
 
 
 def same_batch(a, b):
-    return all(torch.equal(x, y) for x, y in zip((*a[0], a[1]), (*b[0], b[1]), strict=True))
+    return all(torch.equal(x, y) for x, y in zip(*((*c.group, *c._replace(group=target)) for c, target in (a, b)), strict=True))
 
 
 @given(SEED, st.sampled_from(["both", "random"]), st.booleans(), st.integers(1, 9))
@@ -378,7 +429,7 @@ def test_batches_depend_on_seed_and_step_alone(seed, swap, augmented, batch):
     assert not augmented or not same_batch(whole[0], whole[steps // 2])             # another epoch draws anew
 
 
-@given(SEED, st.sampled_from(["both", "random"]), st.integers(1, 9))
+@given(SEED, st.sampled_from(["both", "random", "off"]), st.integers(1, 9))
 def test_an_epoch_holds_every_pair_once_with_the_motion_of_its_direction(seed, swap, batch):
     config, (geometry, motions) = replace(SMALL, swap=swap, batch=batch), drives()
     name, seen = {g["xyz"].tobytes(): (s, i) for s, records in enumerate(geometry) for i, g in enumerate(records)}, []
@@ -389,22 +440,24 @@ def test_an_epoch_holds_every_pair_once_with_the_motion_of_its_direction(seed, s
             assert s == s_ and abs(i - j) == 1
             assert_allclose(y, to_vector(T if i < j else np.linalg.inv(T)), atol=1e-5)
             seen.append((s, min(i, j), i < j))
-        assert swap == "random" or 2 * len({pair[:2] for pair in seen}) == len(seen)        # both directions in one batch
+        assert swap != "both" or 2 * len({pair[:2] for pair in seen}) == len(seen)        # both directions in one batch
     assert sorted({pair[:2] for pair in seen}) == [(s, i) for s in range(2) for i in range(5)]
-    assert len(seen) == len(set(seen)) == (20 if swap == "both" else 10) and {forward for *_, forward in seen} == {True, False}
+    assert len(seen) == len(set(seen)) == (20 if swap == "both" else 10)
+    assert {forward for *_, forward in seen} == ({True} if swap == "off" else {True, False})
 
 
 @given(SEED)
 def test_augmented_pairs_still_fit_their_motion(seed):
     rng = generator(seed)
-    geometry, motions = pairs_of_scans(rng, 6, points=200)
+    geometry, motions = pairs_of_scans(rng, 6, points=200, config=VARIANTS["scales"])
     assert all(g[0]["idx2"].tobytes() == g[1]["idx2"].tobytes() for g in geometry)  # Q is P moved: the same points in the same order
     clouds, T = np.stack([g[d] for d in (0, 1) for g in geometry]), np.concatenate(motions)
     before = clouds.copy()
     T_new = d3dlo.augment(clouds, T, rng)
     for p, q, old, X, Y in zip(clouds[:6], clouds[6:], before[:6], T_new, T):
         assert_allclose(move(X, q["xyz"]), p["xyz"], atol=1e-4)
-        assert_allclose(move(X, q["xyz"][:, None] + q["group"][..., :3]), p["xyz"][:, None] + p["group"][..., :3], atol=1e-4)
+        for group in ("group", "group0", "group1"):
+            assert_allclose(move(X, q["xyz"][:, None] + q[group][..., :3]), p["xyz"][:, None] + p[group][..., :3], atol=1e-4)
         assert np.linalg.det(X[:3, :3]) > 0.999 and np.abs(X - Y).max() > 1e-3      # no reflection is left, and something moved
         assert_array_equal(np.abs(p["xyz"]), np.abs(old["xyz"]))                    # P is at most mirrored
     for field in ("idx2", "idx3"):
@@ -690,7 +743,12 @@ def test_the_cache_holds_what_scan_geometry_says_and_is_made_anew_when_anything_
     assert len(load(replace(SMALL, sa1=Layer(1.0, *SMALL.sa1[1:])))) == 5
     assert len(load(replace(SMALL, sa2=Layer(4.0, 12, 8, (32, 32))))) == 7
     assert len(load(replace(SMALL, spread=2))) == 9
-    assert len(load(replace(SMALL, fe=Layer(None, None, 3, (16, 32)), lr=5.0))) == 9        # what it does not depend on
+    assert len(load(replace(SMALL, sa1=Layer(2.0, 32, 5, (4, 8, 16))))) == 11
+    assert len(load(replace(SMALL, plane=False))) == 13
+    assert len(load(VARIANTS["scales"])) == 15
+    assert len(load(replace(VARIANTS["scales"], scales=(Layer(4.5, None, 3, (6, 10)), Layer(1.0, None, 2, (8, 8)))))) == 17
+    unlike = replace(SMALL, fe=Layer(None, None, 3, (16, 32)), lr=5.0, coordinates=True, cosine=1.0, uncertainty=True, swap="off")
+    assert len(load(unlike)) == 17                      # what it does not depend on
 
 
 def test_a_bad_scan_leaves_nothing_in_the_cache_and_is_named(tmp_path):
@@ -710,7 +768,7 @@ def save_weights(path, config=Config()):
     return net
 
 
-@pytest.mark.parametrize("config", [SMALL, replace(SMALL, batch=3, swap="random", sa1=Layer(1.5, 40, 5, (6, 10))), Config()])
+@pytest.mark.parametrize("config", [SMALL, replace(SMALL, batch=3, swap="random", sa1=Layer(1.5, 40, 5, (6, 10))), *VARIANTS.values(), Config()])
 def test_weights_rebuild_their_network_from_the_file_itself(tmp_path, config):
     net, rng = save_weights(tmp_path / "weights.pt", config), generator(0)
     p, q = cloud(rng, 1100), cloud(rng, 1100)
@@ -804,6 +862,17 @@ def test_eval_writes_what_it_prints_and_metrics_agrees(here, weights, capsys):
     assert metrics.main(["root/poses", "out"]) == 0     # in the camera's frame: the same segments, other steps
     out = capsys.readouterr().out
     assert all(figures(out, name)[:3] == as_printed(results["sequences"][name])[:3] for name in ("03", "07"))
+
+
+def test_all_eleven_sequences_without_truth_are_zipped_for_the_server(here, weights):
+    names = [f"{i}" for i in range(11, 22)]
+    root = write_root(here / "root", names, scans=3)
+    shutil.rmtree(root / "poses")
+    assert d3dlo.main(["eval", "--data", "root", "--weights", str(weights), "--out", "out"]) == 0
+    with zipfile.ZipFile("out/kitti-server.zip") as archive:       # in its root, in the format of the ground truth
+        assert archive.namelist() == [f"{name}.txt" for name in names]
+        for name in archive.namelist():
+            assert archive.read(name) == Path("out", name).read_bytes() and np.loadtxt(archive.open(name)).shape == (3, 12)
 
 
 def test_train_then_eval_then_train_again(here, city, capsys):

@@ -1,0 +1,197 @@
+"""The paper's experiments, from data to a table: our figures beside the paper's.
+
+    python benchmarks/experiments.py table2 --dry-run               # the runs, and the time they will take
+    python benchmarks/experiments.py grouping coordinates           # 10,000 pair-steps a run, two seeds, simulated city
+    python benchmarks/experiments.py table2 table3 --data ROOT --budget 8000000 --seeds 0 1 2
+
+A pair-step is one pair of scans in one direction. All runs of a table have the same number of them, the same data and, seed by seed,
+the same order of pairs; the recipe is the short one (d3dlo.SHORT). Runs lie in OUT, one folder each, named by what they depend on: one that is
+finished is never repeated, one that was interrupted goes on, and tables share them. Each run has one core to itself.
+"""
+import argparse
+import hashlib
+import json
+import math
+import os
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import d3dlo
+import kitti
+import metrics
+from d3dlo import SHORT, Batch, Config, Layer
+
+T1 = Config()
+QUATERNION = T1.mlp._replace(mlp=(64, 7))
+NEIGHBORS = 8, 16, 32, 64, 128
+PAPER_2 = {(8, True): (2.19, 0.00855), (16, True): (2.5, 0.01015), (32, True): (2.53, 0.00937), (64, True): (3.63, 0.01483),
+           (128, True): (3.04, 0.01172), (8, False): (2.29, 0.00946), (16, False): (2.76, 0.01115), (32, False): (2.28, 0.00969),
+           (64, False): (2.52, 0.01057), (128, False): (2.82, 0.01192)}
+PAPER_3 = {(8, True): ((3.49, 0.01393), (2.5, 0.01646)), (8, False): ((3.98, 0.01571), (3.89, 0.02563)), (32, False): ((4.32, 0.01642), (4.07, 0.03089))}
+
+
+def _table_2(n_n, plane):
+    return dict(sa1=T1.sa1._replace(n_n=n_n), plane=plane)
+
+
+def _name_2(n_n, plane):
+    return f"n_n = {n_n}, {'with' if plane else 'without'} plane"
+
+
+# experiment -> variant -> (what differs from the default Config, {split: the paper's E_t [%] and E_r [deg/m]} or its words)
+EXPERIMENTS = {
+    "grouping": {"nearest n_n": (dict(spread=1), "open"), "spread over the nearest 8 n_n": ({}, "open")},
+    "coordinates": {"Table 1": ({}, ""), "coordinates into the mini-PointNet": (dict(coordinates=True), "DeepCLR's")},
+    "table2": {_name_2(*key): (_table_2(*key), {"all": paper}) for key, paper in PAPER_2.items()},
+    "table3": {_name_2(*key): (_table_2(*key), dict(zip(("test", "validation"), paper))) for key, paper in PAPER_3.items()},
+    "loss": {"eq. 2": ({}, "best"), "eq. 2 + eq. 5": (dict(cosine=1.0), "no gain"), "eq. 2 + 0.1 eq. 5": (dict(cosine=0.1), "no gain"),
+             "eq. 2 + eq. 5 of the translation": (dict(cosine=1.0, cosine_of="translation"), "no gain"),
+             "uncertainty weighting": (dict(uncertainty=True), "no gain")},
+    "output": {"Euler angles": ({}, "best"), "quaternion": (dict(mlp=QUATERNION), "no gain"),
+               "quaternion, uncertainty weighting": (dict(mlp=QUATERNION, uncertainty=True), "")},
+    "scales": {"one scale": ({}, "best"), "two scales in SA1: 1 m and 2 m": (dict(scales=(Layer(2.0, None, 8, (4, 8, 16, 32)),)), "no gain")},
+    "swap": {"both directions": ({}, ""), "the paper's coin": (dict(swap="random"), "used"), "forward only": (dict(swap="off"), "")},
+}
+SPLITS_SHOWN = {"table2": ("all",), "table3": ("test", "validation")}       # of the others: test
+
+
+def pair_steps(config, pairs):
+    return pairs * (2 if config.swap == "both" else 1)
+
+
+def config_of(changes, pairs, budget):
+    """The short recipe, as many epochs as the budget holds, and at least one."""
+    config = replace(Config(**SHORT), **changes)
+    return replace(config, epochs=max(1, round(budget / pair_steps(config, pairs))))
+
+
+def folder_of(out, config, seed, chosen):
+    """Where a run lies: named by all it depends on, the data included."""
+    depends = config.as_dict(), seed, [d3dlo.fingerprint(s) for s in chosen]
+    return out / hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def seconds_a_step(config):
+    """One core's time for a pair-step, timed on random points."""
+    n, S = 4, [config.sa1.n_fps, config.sa2.n_fps, config.sa3.n_fps]
+    idx = lambda *shape, below: torch.randint(below, shape)
+    p, q = torch.arange(n).repeat(2), torch.arange(n).repeat(2)
+    batch = Batch(torch.randn(n, S[0], 3), tuple(torch.randn(n, S[0], layer.n_n, 4) for layer in (config.sa1, *config.scales)),
+                  idx(n, S[1], config.sa2.n_n, below=S[0]), idx(n, S[2], config.sa3.n_n, below=S[1]), p, q,
+                  idx(2 * n, S[0], config.fe.n_n, below=S[0]))
+    net, times = d3dlo.D3DLO(config), []
+    for _ in range(3):
+        start = time.perf_counter()
+        net(batch).square().mean().backward()
+        times.append(time.perf_counter() - start)
+    return min(times) / len(p)
+
+
+def run_one(run, config, root, sequences, seed):
+    """One training and its evaluation on all sequences, in a process of its own with one thread."""
+    job = json.dumps(dict(run=str(run), config=config.as_dict(), root=str(root), sequences=sequences, seed=seed))
+    run.mkdir(parents=True, exist_ok=True)
+    with open(run / "output.txt", "a") as log:
+        done = subprocess.run([sys.executable, __file__, "--child", job], stdout=log, stderr=subprocess.STDOUT,
+                              env=os.environ | {"OMP_NUM_THREADS": "1"})
+    if done.returncode:
+        raise RuntimeError(f"{run}: failed, see {run}/output.txt")
+
+
+def child(run, config, root, sequences, seed):
+    torch.set_num_threads(1)
+    d3dlo.keep_freed_memory()
+    d3dlo.train(root, sequences, run, seed=seed, config=Config(**config), resume=(Path(run) / "config.json").exists())
+    d3dlo.evaluate(root, run, out=Path(run) / "all")
+
+
+def figures(run, split):
+    """E_t, E_r, t step, r step of a run on a split."""
+    results = json.loads((run / "all" / "results.json").read_text())
+    result = results["pooled"] if split == "all" else results["splits"][split]
+    return [result[key] if result[key] is not None else math.nan for key in ("E_t", "E_r", "t_step_m", "r_step_deg")]
+
+
+def table(name, variants, runs, out, caption):
+    """The Markdown table of an experiment; mean over the seeds, and their range when there are several."""
+    header = ["", "split", "parameters", "paper: E_t [%]", "E_r [deg/m]", "here: E_t [%]", "E_r [deg/m]", "step [m]", "[deg]"]
+    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
+    for variant, (_, paper) in variants.items():
+        config = runs[variant][0][0]
+        parameters = sum(p.numel() for p in d3dlo.D3DLO(config).parameters())
+        for split in SPLITS_SHOWN.get(name, ("test",)):
+            seeds = np.array([figures(run, split) for _, run, _ in runs[variant]])     # (seeds,4)
+            cells = [f"{c.mean():.{digits}f}" + (f" ({c.min():.{digits}f} to {c.max():.{digits}f})" if len(c) > 1 else "")
+                     for c, digits in zip(seeds.T, (3, 5, 4, 4))]
+            theirs = [f"{paper[split][0]}", f"{paper[split][1]:.5f}"] if isinstance(paper, dict) else [paper, ""]
+            lines.append("| " + " | ".join([variant, split, f"{parameters:,}", *theirs, *cells]) + " |")
+    text = f"# {name}\n\n" + "\n".join(lines) + f"\n\n{caption}\n"
+    with metrics.replacing(out / f"{name}.md") as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    print(f"\n{text}\n{out}/{name}.md")
+
+
+def main():
+    """The command line."""
+    if sys.argv[1:2] == ["--child"]:
+        child(**json.loads(sys.argv[2]))
+        return 0
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("experiments", nargs="+", choices=EXPERIMENTS, metavar="NAME", help=f"of {', '.join(EXPERIMENTS)}")
+    parser.add_argument("--data", metavar="ROOT", help=f"folder in KITTI odometry layout (default: the simulated city, {d3dlo.SIMULATED})")
+    parser.add_argument("--sequences", nargs="+", default=["train"], metavar="NN", help="to train on (default: train)")
+    parser.add_argument("--budget", type=int, default=10000, metavar="N", help="pair-steps of a training (default: 10,000; the paper's is some 8,000,000)")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1], metavar="N")
+    parser.add_argument("--jobs", type=int, default=kitti.cores(), metavar="N", help="trainings at a time (default: one for each core)")
+    parser.add_argument("--out", type=Path, default=Path("runs/experiments"), metavar="DIR")
+    parser.add_argument("--dry-run", action="store_true", help="list the runs and the time they will take")
+    args = parser.parse_args()
+    d3dlo.keep_freed_memory()
+    root = Path(args.data) if args.data else kitti.simulate(d3dlo.SIMULATED)
+    everything, chosen = kitti.open_sequences(root), kitti.open_sequences(root, args.sequences)
+    pairs = sum(len(s.motions()) for s in chosen)
+
+    runs = {name: {variant: [(config, folder_of(args.out, config, seed, chosen), seed) for seed in args.seeds
+                             for config in [config_of(changes, pairs, args.budget)]]
+                   for variant, (changes, _) in EXPERIMENTS[name].items()} for name in args.experiments}
+    every = {run: (config, seed) for variants in runs.values() for some in variants.values() for config, run, seed in some}
+    todo = {run: job for run, job in every.items() if not (run / "all" / "results.json").exists()}
+    print(f"{len(every)} runs, {len(every) - len(todo)} of them finished; {pairs:,} pairs of {root}, budget {args.budget:,} pair-steps", flush=True)
+    if args.dry_run:
+        torch.set_num_threads(1)
+        cost = {config: seconds_a_step(config) for config in {config for config, _ in todo.values()}}
+        hours = 0
+        for name, variants in runs.items():
+            for variant, some in variants.items():
+                for config, run, seed in some:
+                    if run in todo:
+                        need = cost[config] * config.epochs * pair_steps(config, pairs) / 3600
+                        hours += need if todo.pop(run) else 0
+                        print(f"{name}: {variant}, seed {seed}: {config.epochs} epochs, {need * 60:.0f} minutes of one core -> {run}")
+        print(f"{hours / args.jobs:.1f} hours with {args.jobs} at a time, and the caches")
+        return 0
+    for config in dict.fromkeys(replace(c, epochs=1) for c, _ in todo.values()):       # caches first, with all cores
+        d3dlo.load_geometry(everything, config)
+    with ThreadPoolExecutor(args.jobs) as pool:
+        jobs = [pool.submit(run_one, run, config, root, [s.name for s in chosen], seed) for run, (config, seed) in todo.items()]
+        for job in kitti.progress(jobs, len(jobs), "trainings"):
+            job.result()
+    for name, variants in runs.items():
+        caption = (f"{'Simulated city' if not args.data else root}: trained on sequences {' '.join(s.name for s in chosen)} ({pairs:,} pairs), "
+                   f"{args.budget:,} pair-steps a run (the paper's are some 8 million), seeds {' '.join(map(str, args.seeds))}; "
+                   "mean over the seeds, their range in brackets. Made by `python benchmarks/experiments.py " + " ".join([name, *(
+                       ["--data", str(args.data)] if args.data else []), "--budget", str(args.budget), "--seeds", *map(str, args.seeds)]) + "`.")
+        table(name, EXPERIMENTS[name], variants, args.out, caption)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
