@@ -159,7 +159,7 @@ class Objective(nn.Module):
             y = torch.cat([y[:, :3], sign * y[:, 3:]], 1)
         if config.uncertainty:
             parts = torch.stack([loss_unweighted(y_hat[:, part], y[:, part]) for part in (slice(3), slice(3, None))])
-            loss = (torch.exp(-self.log_variance) * parts + self.log_variance).sum()           # Kendall and Cipolla 2017, eq. 7
+            loss = (torch.exp(-self.log_variance) * parts + self.log_variance).sum()           # Kendall and Cipolla 2017
         else:
             loss = loss_unweighted(y_hat, y)
         if config.cosine:
@@ -176,7 +176,7 @@ SPACED = np.array([int(f"{i:b}", 4) for i in range(256)], np.uint16)        # th
 
 def _side_by_side(xyz):
     """(N,3) -> (N,) indices, neighbours near each other: a Z-order curve over azimuth and the logarithm of the range, by which the points
-    of a LiDAR are about evenly dense. Twice as quick as a tree."""
+    of a LiDAR are about evenly dense. It takes a third of a tree's time."""
     x, y = xyz[:, 0], xyz[:, 1]
     with np.errstate(all="ignore"):                         # any order is right, this one is only quick
         azimuth, radius = np.arctan2(y, x), np.log(np.hypot(x, y) + 1)
@@ -253,9 +253,9 @@ def geometry_dtype(config):
                      ("dropped", "i4")])                # NaN or infinite points left out
 
 
-def groups(config):
-    """The names of a record's groups, one for each scale of SA1."""
-    return ["group", *(f"group{i}" for i in range(len(config.scales)))]
+def groups(records):
+    """The names of the groups in records, one for each scale of SA1."""
+    return [name for name in records.dtype.names if name.startswith("group")]
 
 
 GEOMETRY = 2    # raise when scan_geometry changes, so that older caches are not read
@@ -275,14 +275,14 @@ def scan_geometry(scan, config=Config()):
         scan = kitti.remove_plane(scan)
     n1, (r2, n2, k2, _), (r3, n3, k3, _) = config.sa1.n_fps, config.sa2, config.sa3
     if len(scan) < n1:
-        raise ValueError(f"{len(scan)} usable points (finite, nearer than {MAX_RANGE:.0f} m), at least {n1} are needed")
+        raise ValueError(f"{len(scan)} usable points (finite, nearer than {MAX_RANGE:.0f} m{'' if config.plane else ', off the ground'}), at least {n1} are needed")
     cloud = np.ascontiguousarray(scan[:, :3])
     with ThreadPoolExecutor(1) as aside:
         tree = aside.submit(cKDTree, cloud, leafsize=48, balanced_tree=False, compact_nodes=False)     # quicker to build, as good to ask
         centroids = farthest_point_sampling(cloud, n1)
     out = np.empty((), geometry_dtype(config))
     out["xyz"] = xyz = cloud[centroids]                                                        # (n1,3)
-    for name, scale in zip(groups(config), (config.sa1, *config.scales)):
+    for name, scale in zip(groups(out), (config.sa1, *config.scales)):
         group = scan[group_ball(cloud, centroids, scale.r, scale.n_n, tree.result(), config.spread)]   # (n1,k1,4)
         group[..., :3] -= xyz[:, None]
         out[name] = group
@@ -361,7 +361,7 @@ def make_batch(clouds, p, q, config, device="cpu"):
 
     def tensor(array):
         return torch.from_numpy(np.ascontiguousarray(array)).to(device)
-    return Batch(tensor(clouds["xyz"]), tuple(tensor(clouds[name]) for name in groups(config)), tensor(clouds["idx2"].astype(np.int64)),
+    return Batch(tensor(clouds["xyz"]), tuple(tensor(clouds[name]) for name in groups(clouds)), tensor(clouds["idx2"].astype(np.int64)),
                  tensor(clouds["idx3"].astype(np.int64)), tensor(p), tensor(q), tensor(idx_fe))
 
 
@@ -522,7 +522,8 @@ class D3DLO(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(config.mpn.mlp[-1], hidden), nn.BatchNorm1d(hidden), nn.ReLU(), nn.Linear(hidden, out))
 
     def forward(self, batch):
-        """Batch -> (B,6): [tx, ty, tz] m and [roll, pitch, yaw] degrees of T_pq, extrinsic x-y-z (section 3.2)."""
+        """Batch -> (B,6): [tx, ty, tz] m and [roll, pitch, yaw] degrees of T_pq, extrinsic x-y-z (section 3.2). With Config's
+        quaternion (B,7), see `from_output`."""
         p, q, (n2, n3) = batch.p, batch.q, (batch.idx2.shape[1], batch.idx3.shape[1])
         feat = [sa.forward_grouped(group) for sa, group in zip((self.sa1, *self.scales), batch.group)]
         feat = torch.cat(feat, 2) if self.scales else feat[0]                                  # (C,1024,32)
@@ -607,14 +608,13 @@ def augment(clouds, T_pq, rng):
     mirrored = rng.random(n) < 0.5
     sign = np.where(np.tile(mirrored, 2), -1, 1).astype(np.float32)
     clouds["xyz"][..., 1] *= sign[:, None]
-    names = [name for name in clouds.dtype.names if name.startswith("group")]
-    for name in names:
+    for name in groups(clouds):
         clouds[name][..., 1] *= sign[:, None, None]
     M = np.where(mirrored[:, None, None], np.diag([1.0, -1, 1, 1]), np.eye(4))
     A = from_vector(rng.normal(size=(n, 6)) * [0.25, 0.1, 0.03, 0.1, 0.1, 1.0])   # sigmas in m, degrees
     R, t = A[:, :3, :3].astype(np.float32), A[:, :3, 3].astype(np.float32)
     clouds["xyz"][n:] = clouds["xyz"][n:] @ R.transpose(0, 2, 1) + t[:, None]
-    for name in names:
+    for name in groups(clouds):
         clouds[name][n:, ..., :3] = clouds[name][n:, ..., :3] @ R.transpose(0, 2, 1)[:, None]
     return M @ T_pq @ M @ invert(A)
 
@@ -774,20 +774,22 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu")
     pooled = {group: {p: summary(names, p) for p in scores} for group, names in groups.items()}
     results = {**source, "sequences": each, "splits": {g: p["network"] for g, p in pooled.items() if g != "all"},
                "pooled": pooled["all"]["network"], "predictors": {c: {g: p[c] for g, p in pooled.items()} for c in constant}}
+    plain = json.loads(json.dumps(results), parse_constant=lambda nan: None)    # JSON has no NaN
+    with metrics.replacing(out / "results.json") as temporary:
+        temporary.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
+    written = f"trajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)\nfigures       {out}/results.json"
     server = [f"{i}.txt" for i in range(11, 22)]                # KITTI's sequences without ground truth
     if {Path(name).stem for name in server} <= set(known):
         with metrics.replacing(out / "kitti-server.zip") as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
             for name in server:                                 # in its root, as the devkit's readme wants them
                 archive.write(out / name, name)
-    plain = json.loads(json.dumps(results), parse_constant=lambda nan: None)    # JSON has no NaN
-    with metrics.replacing(out / "results.json") as temporary:
-        temporary.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
+        written += f"\nto submit     {out}/kitti-server.zip"
     rows = [metrics.row(name + " *" * s["trained_on"], s) for name, s in each.items()]
     for group, predictions in pooled.items():
         rows += [metrics.row(group + " *" * s["trained_on"] if p == "network" else f"  {p}", s) for p, s in predictions.items()]
     return (metrics.table(metrics.HEADER, rows) + "\n*: trained on. E_t, E_r: KITTI's segments of 100 to 800 m, rectified left camera "
             "frame. t step, r step: mean length and\nangle of inv(T_est) @ T_true of a step, Velodyne frame. -: no such segment, or no "
-            f"ground truth.\ntrajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)\nfigures       {out}/results.json")
+            f"ground truth.\n{written}")
 
 
 # ------------------------------------------------------------------------------------------------------------- command line
