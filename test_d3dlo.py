@@ -1,6 +1,6 @@
 """Properties of D3DLO. Every expectation comes from an independent source: brute force, SciPy, a definition written out, or a closed
 form. Real data are optional: D3DLO_KITTI names a folder in KITTI odometry layout; without it those tests are skipped."""
-import json, math, os, pickle, re, shutil, subprocess, sys, types, warnings, zipfile
+import json, math, os, pickle, re, runpy, shutil, subprocess, sys, types, warnings, zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -261,6 +261,16 @@ def test_table_1_has_61290_parameters():
 def test_parameters_of_the_variants(changes, parameters):
     assert sum(p.numel() for p in D3DLO(Config(**changes)).parameters()) == parameters
     assert sum(p.numel() for p in d3dlo.Objective(Config(**changes)).parameters()) == 2 * changes.get("uncertainty", 0)
+
+
+def test_the_paper_s_experiments_differ_in_what_they_say():
+    experiments = runpy.run_path(str(HERE / "benchmarks" / "experiments.py"))
+    for name, variants in experiments["EXPERIMENTS"].items():
+        configs = [experiments["config_of"](changes, 100, 1500) for changes, _ in variants.values()]
+        assert len(set(configs)) == len(configs) > 1 and all(Config(**config.as_dict()) == config for config in configs)
+        assert {config.epochs * 100 * (2 if config.swap == "both" else 1) for config in configs} <= {1500, 1600}      # the same work for all
+    assert {(config.sa1.n_n, config.plane) for config in (experiments["config_of"](changes, 100, 1) for changes, _ in experiments["EXPERIMENTS"]["table2"].values())
+            } == {(n, plane) for n in (8, 16, 32, 64, 128) for plane in (True, False)}
 
 
 def plain(net, b):
