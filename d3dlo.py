@@ -92,6 +92,8 @@ class Config:
             raise ValueError("Config: every MLP needs at least 2 layers")
         if not 65536 > self.sa1.n_fps >= self.sa2.n_fps >= self.sa3.n_fps > 0:
             raise ValueError("Config: n_fps of sa1, sa2, sa3 must not grow, and stay below 65,536")
+        if min(self.epochs, self.batch, self.spread, *(layer.n_n for layer in (self.sa1, self.fe, self.sa2, self.sa3, *self.scales))) < 1:
+            raise ValueError("Config: epochs, batch, spread and every n_n must be 1 or more")
         if len(self.mlp.mlp) != 2 or self.mlp.mlp[1] not in (6, 7):
             raise ValueError("Config: mlp has two layers, the last of 6 outputs (Euler angles) or 7 (quaternion)")
         for name, choices in ("schedule", ("steps", "one-cycle")), ("swap", ("both", "random", "off")), ("cosine_of", ("motion", "translation")):
@@ -103,7 +105,7 @@ class Config:
         return json.loads(json.dumps(asdict(self)))
 
 
-SHORT = dict(epochs=9, batch=8, lr=1e-2, schedule="one-cycle", augment=True)      # the 15-minute training on the simulated city
+SHORT = dict(epochs=9, batch=8, lr=1e-2, schedule="one-cycle", augment=True)      # the 12-minute training on the simulated city
 
 
 # ------------------------------------------------------------------------------------ sections 3.1, 3.2: problem and objective
@@ -247,7 +249,7 @@ def geometry_dtype(config):
     (_, n1, k1, _), (_, n2, k2, _), (_, n3, k3, _) = config.sa1, config.sa2, config.sa3
     return np.dtype([("xyz", "f4", (n1, 3)),            # centroids of SA1, of which the first n2 and n3 are those of SA2 and SA3
                      ("group", "f4", (n1, k1, 4)),      # their neighbours: offset [m] and intensity
-                     *((f"group{i}", "f4", (n1, scale.n_n, 4)) for i, scale in enumerate(config.scales)),
+                     *((f"group{i}", "f4", (n1, scale.n_n, 4)) for i, scale in enumerate(config.scales, 2)),
                      ("idx2", "u2", (n2, k2)),          # neighbours in SA2, of SA1's centroids
                      ("idx3", "u2", (n3, k3)),          # neighbours in SA3, of SA2's
                      ("dropped", "i4")])                # NaN or infinite points left out
@@ -452,15 +454,19 @@ def linear_norm_relu_max(linear, norm, h):
 
 class MiniPointNet(nn.Module):
     """Section 3.3.1: an MLP shared by all points, h: R^D -> R^D', then the element-wise maximum over them. Every layer is linear,
-    batch normalisation, ReLU. It is the core of SA and FE too. The caller applies linears[0], which SA and FE split."""
+    batch normalisation, ReLU. It is the core of SA and FE too, which apply the first linear layer in their own way."""
 
     def __init__(self, d_in, widths):
         super().__init__()
         self.linears = nn.ModuleList(nn.Linear(a, b) for a, b in zip((d_in, *widths), widths))
         self.norms = nn.ModuleList(nn.BatchNorm2d(b) for b in widths)
 
-    def forward(self, z):
-        """First linear layer's output (B,S,k,D1) -> (B,S,D'), the maximum over k."""
+    def forward(self, x):
+        """(B,S,k,D) -> (B,S,D'), the maximum over k."""
+        return self.rest(self.linears[0](x))
+
+    def rest(self, z):
+        """All that follows the first linear layer, from its output (B,S,k,D1)."""
         h = norm_relu(self.norms[0], z)
         for linear, norm in zip(self.linears[1:-1], self.norms[1:-1]):
             h = norm_relu(norm, linear(h))
@@ -483,11 +489,7 @@ class SetAbstraction(nn.Module):
         W_x, W_f = self.h.linears[0].weight.split([3, feat.shape[2]], dim=1)
         u = xyz @ W_x.t() + feat @ W_f.t()                                                     # (B,n,D1)
         v = self.h.linears[0].bias - xyz[:, :idx.shape[1]] @ W_x.t()                           # (B,S,D1)
-        return self.h(GatherAdd.apply(u, v, idx))
-
-    def forward_grouped(self, group):
-        """The same for SA1, whose neighbours come gathered: (C,S,k,3+c) offsets and intensities -> (C,S,D')."""
-        return self.h(self.h.linears[0](group))
+        return self.h.rest(GatherAdd.apply(u, v, idx))
 
 
 class FlowEmbedding(nn.Module):
@@ -503,7 +505,7 @@ class FlowEmbedding(nn.Module):
         W_x, W_f, W_g = self.h.linears[0].weight.split([3, feat_p.shape[2], feat_q.shape[2]], dim=1)
         u = xyz_q @ W_x.t() + feat_q @ W_g.t()                                                 # (B,n,D1)
         v = self.h.linears[0].bias + feat_p @ W_f.t() - xyz_p @ W_x.t()                        # (B,S,D1)
-        return self.h(GatherAdd.apply(u, v, idx))
+        return self.h.rest(GatherAdd.apply(u, v, idx))
 
 
 class D3DLO(nn.Module):
@@ -525,7 +527,7 @@ class D3DLO(nn.Module):
         """Batch -> (B,6): [tx, ty, tz] m and [roll, pitch, yaw] degrees of T_pq, extrinsic x-y-z (section 3.2). With Config's
         quaternion (B,7), see `from_output`."""
         p, q, (n2, n3) = batch.p, batch.q, (batch.idx2.shape[1], batch.idx3.shape[1])
-        feat = [sa.forward_grouped(group) for sa, group in zip((self.sa1, *self.scales), batch.group)]
+        feat = [sa.h(group) for sa, group in zip((self.sa1, *self.scales), batch.group)]       # eq. 3, its neighbours come gathered
         feat = torch.cat(feat, 2) if self.scales else feat[0]                                  # (C,1024,32)
         feat_p, feat_q = feat.index_select(0, p), feat.index_select(0, q)                      # feat[p] is slow on the way back
         xyz = batch.xyz[p]                                                                     # (B,1024,3)
@@ -534,7 +536,7 @@ class D3DLO(nn.Module):
         flow = self.sa3(xyz[:, :n2], flow, batch.idx3[p])                                      # (B,64,64)
         if self.config.coordinates:
             flow = torch.cat([xyz[:, :n3] / 10, flow], 2)                                      # (B,64,67), in tens of metres
-        whole = self.mpn(self.mpn.linears[0](flow)[:, None])[:, 0]                             # (B,256), the maximum over all 64
+        whole = self.mpn(flow[:, None])[:, 0]                                                  # (B,256), the maximum over all 64
         y = self.mlp(whole)                                                                    # (B,6)
         return y if y.shape[1] == 6 else torch.cat([y[:, :3], F.normalize(y[:, 3:])], 1)
 
@@ -606,16 +608,13 @@ def augment(clouds, T_pq, rng):
     place; (n,4,4) -> (n,4,4)."""
     n = len(T_pq)
     mirrored = rng.random(n) < 0.5
-    sign = np.where(np.tile(mirrored, 2), -1, 1).astype(np.float32)
-    clouds["xyz"][..., 1] *= sign[:, None]
-    for name in groups(clouds):
-        clouds[name][..., 1] *= sign[:, None, None]
     M = np.where(mirrored[:, None, None], np.diag([1.0, -1, 1, 1]), np.eye(4))
-    A = from_vector(rng.normal(size=(n, 6)) * [0.25, 0.1, 0.03, 0.1, 0.1, 1.0])   # sigmas in m, degrees
-    R, t = A[:, :3, :3].astype(np.float32), A[:, :3, 3].astype(np.float32)
-    clouds["xyz"][n:] = clouds["xyz"][n:] @ R.transpose(0, 2, 1) + t[:, None]
-    for name in groups(clouds):
-        clouds[name][n:, ..., :3] = clouds[name][n:, ..., :3] @ R.transpose(0, 2, 1)[:, None]
+    A = from_vector(rng.normal(size=(n, 6)) * [0.25, 0.1, 0.03, 0.1, 0.1, 1.0])   # sigmas in m, degrees; most yaw, which driving has least of
+    moves = np.concatenate([M, A @ M]).astype(np.float32)                                      # (2n,4,4)
+    for name in ("xyz", *groups(clouds)):
+        xyz = clouds[name][..., :3]
+        xyz[...] = (xyz.reshape(2 * n, -1, 3) @ moves[:, :3, :3].transpose(0, 2, 1)).reshape(xyz.shape)
+    clouds["xyz"] += moves[:, None, :3, 3]
     return M @ T_pq @ M @ invert(A)
 
 
@@ -708,7 +707,7 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
     usable = D3DLO(config).to(device)
 
     def fixed_batches():        # drawn like those of the training
-        return batches(geometry, motions, config, (seed, 1), 0, min(25, total), device)
+        return batches(geometry, motions, config, (seed, 2 ** 31), 0, min(25, total), device)
 
     def store():
         save(run / "checkpoint.pt", config=config.as_dict(), step=step, losses=losses, **remember,
@@ -769,9 +768,9 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu")
         return metrics.summary([e for e, _ in pooled], [e for _, e in pooled]) | {"trained_on": any(known[n] for n in names)}
 
     splits = {split: [n for n in names if n in known] for split, names in SPLITS.items()}
-    groups = {split: names for split, names in splits.items() if names} | {"all": list(known)}
+    parts = {split: names for split, names in splits.items() if names} | {"all": list(known)}
     each = {name: summary([name]) for name in known}
-    pooled = {group: {p: summary(names, p) for p in scores} for group, names in groups.items()}
+    pooled = {group: {p: summary(names, p) for p in scores} for group, names in parts.items()}
     results = {**source, "sequences": each, "splits": {g: p["network"] for g, p in pooled.items() if g != "all"},
                "pooled": pooled["all"]["network"], "predictors": {c: {g: p[c] for g, p in pooled.items()} for c in constant}}
     plain = json.loads(json.dumps(results), parse_constant=lambda nan: None)    # JSON has no NaN
@@ -808,6 +807,7 @@ def train(data=None, sequences=None, out=None, epochs=None, batch=None, neighbor
                          sa1=config.sa1._replace(n_n=neighbors or config.sa1.n_n))
     if resume:
         config, data, sequences, seed = begun_with(run)
+    data = data and str(data)
     root = Path(data) if data else kitti.simulate(SIMULATED)
     there = [s.name for s in kitti.open_sequences(root)]
     chosen = kitti.open_sequences(root, sequences or ("train" if set(SPLITS["train"]) & set(there) else "all"))
