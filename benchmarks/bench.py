@@ -5,7 +5,7 @@
     python benchmarks/bench.py fps training             # only some rows
 
 The plain forms are those the tests prove the fast ones equal to, so the test packages are needed: pip install ".[test]".
-Peers are compared with when they are there: pip install fpsample kiss-icp. Keep the machine free of other work.
+Peers are compared with when they are there: pip install fpsample kiss-icp. Linux only; keep the machine free of other work.
 """
 import argparse
 import os
@@ -47,10 +47,10 @@ def in_turn(works, rounds):
     return {name: np.array(times) for name, times in zip(works, zip(*([seconds(w) for w in works.values()] for _ in range(rounds))))}
 
 
-def row(work, times, unit="ms", per=1, baseline=None):
+def row(work, times, unit="ms"):
     """A line of the table for each entry but the baseline (the first). Rounds are compared one by one."""
-    base = baseline or next(iter(times))
-    show = lambda t: f"{np.median(t) / per * (1000 if unit == 'ms' else 1):.3g} {unit}"
+    base = next(iter(times))
+    show = lambda t: f"{np.median(t) * (1000 if unit == 'ms' else 1):.3g} {unit}"
     for name in times:
         if name != base:
             ratio = times[base] / times[name]
@@ -111,7 +111,7 @@ def fps(sequences):
             works["fpsample exact"] = lambda: fpsample.fps_sampling(xyz, 1024, start_idx=0)
             works["fpsample buckets"] = lambda: fpsample.bucket_fps_kdline_sampling(xyz, 1024, h=7, start_idx=0)
         times = in_turn(works, 7)
-        for base in times.keys() - {"here"}:
+        for base in [name for name in times if name != "here"]:
             row(f"FPS, 1,024 of {len(xyz):,} points, one core", {base: times[base], "here": times["here"]})
 
 
@@ -205,9 +205,8 @@ def metric(sequences):
     drives = [accumulate(motion(rng, (1.0, 0.05, 0.02, 0.1, 0.1, 0.9), n - 1)) for n in
               (4541, 1101, 4661, 801, 271, 2761, 1101, 1101, 4071, 1591, 1201)]
     pairs = [(T, perturbed(rng, T)) for T in drives]
-    slow = np.array([seconds(lambda: [devkit(*p) for p in pairs])])
-    fast = in_turn({"here": lambda: [metrics.segment_errors(*p) for p in pairs]}, 5)["here"]
-    row("segment errors, 23,201 poses", {"devkit's loops": slow.repeat(5), "here": fast}, "s")
+    row("segment errors, 23,201 poses", in_turn({"devkit's loops": lambda: [devkit(*p) for p in pairs],
+                                                 "here": lambda: [metrics.segment_errors(*p) for p in pairs]}, 5), "s")
 
 
 ROWS = {f.__name__: f for f in (fps, geometry, odometry, training, inference, cache, startup, metric, memory, compiled)}

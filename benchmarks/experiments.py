@@ -4,9 +4,9 @@
     python benchmarks/experiments.py grouping coordinates           # 10,000 pair-steps a run, two seeds, simulated city
     python benchmarks/experiments.py table2 table3 --data ROOT --budget 8000000 --seeds 0 1 2
 
-A pair-step is one pair of scans in one direction. All runs of a table have the same number of them, the same data and, seed by seed,
-the same order of pairs; the recipe is the short one (d3dlo.SHORT). Runs lie in OUT, one folder each, named by what they depend on: one that is
-finished is never repeated, one that was interrupted goes on, and tables share them. Each run has one core to itself.
+A pair-step is one pair of scans in one direction. All runs of a table have the same number of them in batches of the same size, the same
+data and, seed by seed, the same order of pairs; the recipe is the short one (d3dlo.SHORT). Runs lie in OUT, one folder each, named by what they
+depend on: one that is finished is never repeated, one that was interrupted goes on, and tables share them. Each run has one core to itself.
 """
 import argparse
 import hashlib
@@ -58,46 +58,51 @@ EXPERIMENTS = {
     "output": {"Euler angles": ({}, "best"), "quaternion": (dict(mlp=QUATERNION), "no gain"),
                "quaternion, uncertainty weighting": (dict(mlp=QUATERNION, uncertainty=True), "")},
     "scales": {"one scale": ({}, "best"), "two scales in SA1: 1 m and 2 m": (dict(scales=(Layer(2.0, None, 8, (4, 8, 16, 32)),)), "no gain")},
-    "swap": {"both directions": ({}, ""), "the paper's coin": (dict(swap="random"), "used"), "forward only": (dict(swap="off"), "")},
+    "swap": {"both directions": ({}, ""), "the paper's coin": (dict(swap="random", batch=2 * SHORT["batch"]), "used"),
+             "forward only": (dict(swap="off", batch=2 * SHORT["batch"]), "")},
 }
 SPLITS_SHOWN = {"table2": ("all",), "table3": ("test", "validation")}       # of the others: test
 
 
 def pair_steps(config, pairs):
-    return pairs * (2 if config.swap == "both" else 1)
+    """Of a whole training."""
+    return config.epochs * pairs * (2 if config.swap == "both" else 1)
 
 
 def config_of(changes, pairs, budget):
-    """The short recipe, as many epochs as the budget holds, and at least one."""
+    """The short recipe, as many epochs as the budget holds, and at least one over both directions."""
     config = replace(Config(**SHORT), **changes)
-    return replace(config, epochs=max(1, round(budget / pair_steps(config, pairs))))
+    return replace(config, epochs=max(1, round(budget / (2 * pairs))) * (1 if config.swap == "both" else 2))
 
 
-def folder_of(out, config, seed, chosen):
+def folder_of(out, config, seed, chosen, everything):
     """Where a run lies: named by all it depends on, the data included."""
-    depends = config.as_dict(), seed, [d3dlo.fingerprint(s) for s in chosen]
+    changes = {name: value for name, value in config.as_dict().items() if value != Config().as_dict()[name]}
+    depends = changes, seed, d3dlo.GEOMETRY, [s.name for s in chosen], [d3dlo.fingerprint(s) for s in everything]
     return out / hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def seconds_a_step(config):
     """One core's time for a pair-step, timed on random points."""
-    n, S = 4, [config.sa1.n_fps, config.sa2.n_fps, config.sa3.n_fps]
-    idx = lambda *shape, below: torch.randint(below, shape)
-    p, q = torch.arange(n).repeat(2), torch.arange(n).repeat(2)
-    batch = Batch(torch.randn(n, S[0], 3), tuple(torch.randn(n, S[0], layer.n_n, 4) for layer in (config.sa1, *config.scales)),
-                  idx(n, S[1], config.sa2.n_n, below=S[0]), idx(n, S[2], config.sa3.n_n, below=S[1]), p, q,
-                  idx(2 * n, S[0], config.fe.n_n, below=S[0]))
-    net, times = d3dlo.D3DLO(config), []
-    for _ in range(3):
+    rng, records = np.random.default_rng(0), np.zeros(config.batch + 1, d3dlo.geometry_dtype(config))
+    records["xyz"] = rng.normal(size=records["xyz"].shape) * 20
+    for name in d3dlo.groups(records):
+        records[name] = rng.normal(size=records[name].shape)
+    for name, layer in ("idx2", config.sa1), ("idx3", config.sa2):
+        records[name] = rng.integers(layer.n_fps, size=records[name].shape)
+    motions = [np.tile(np.eye(4), (config.batch, 1, 1))]
+    net, objective, times = d3dlo.D3DLO(config), d3dlo.Objective(config), []
+    for _ in range(2):
         start = time.perf_counter()
-        net(batch).square().mean().backward()
+        batch, target = d3dlo.training_batch([records], motions, [(0, i) for i in range(config.batch)], config, rng)
+        objective(net(batch), target).backward()
         times.append(time.perf_counter() - start)
-    return min(times) / len(p)
+    return min(times) / len(target)
 
 
-def run_one(run, config, root, sequences, seed):
-    """One training and its evaluation on all sequences, in a process of its own with one thread."""
-    job = json.dumps(dict(run=str(run), config=config.as_dict(), root=str(root), sequences=sequences, seed=seed))
+def run_one(run, config, root, sequences, evaluated, seed):
+    """One training and its evaluation, in a process of its own with one thread."""
+    job = json.dumps(dict(run=str(run), config=config.as_dict(), root=str(root), sequences=sequences, evaluated=evaluated, seed=seed))
     run.mkdir(parents=True, exist_ok=True)
     with open(run / "output.txt", "a") as log:
         done = subprocess.run([sys.executable, __file__, "--child", job], stdout=log, stderr=subprocess.STDOUT,
@@ -106,11 +111,11 @@ def run_one(run, config, root, sequences, seed):
         raise RuntimeError(f"{run}: failed, see {run}/output.txt")
 
 
-def child(run, config, root, sequences, seed):
+def child(run, config, root, sequences, evaluated, seed):
     torch.set_num_threads(1)
     d3dlo.keep_freed_memory()
     d3dlo.train(root, sequences, run, seed=seed, config=Config(**config), resume=(Path(run) / "config.json").exists())
-    d3dlo.evaluate(root, run, out=Path(run) / "all")
+    d3dlo.evaluate(root, run, evaluated, out=Path(run) / "all")
 
 
 def figures(run, split):
@@ -156,37 +161,46 @@ def main():
     args = parser.parse_args()
     d3dlo.keep_freed_memory()
     root = Path(args.data) if args.data else kitti.simulate(d3dlo.SIMULATED)
-    everything, chosen = kitti.open_sequences(root), kitti.open_sequences(root, args.sequences)
+    everything = [s for s in kitti.open_sequences(root) if s.poses is not None]
+    chosen, names = kitti.open_sequences(root, args.sequences), [s.name for s in everything]
+    for split in {split for name in args.experiments for split in SPLITS_SHOWN.get(name, ("test",))} - {"all"}:
+        if not set(kitti.SPLITS[split]) & set(names):
+            parser.error(f"{root}: none of the sequences of the {split} split ({' '.join(kitti.SPLITS[split])}), on which the table is measured")
     pairs = sum(len(s.motions()) for s in chosen)
 
-    runs = {name: {variant: [(config, folder_of(args.out, config, seed, chosen), seed) for seed in args.seeds
+    runs = {name: {variant: [(config, folder_of(args.out, config, seed, chosen, everything), seed) for seed in args.seeds
                              for config in [config_of(changes, pairs, args.budget)]]
                    for variant, (changes, _) in EXPERIMENTS[name].items()} for name in args.experiments}
     every = {run: (config, seed) for variants in runs.values() for some in variants.values() for config, run, seed in some}
     todo = {run: job for run, job in every.items() if not (run / "all" / "results.json").exists()}
-    print(f"{len(every)} runs, {len(every) - len(todo)} of them finished; {pairs:,} pairs of {root}, budget {args.budget:,} pair-steps", flush=True)
+    steps = pair_steps(next(iter(every.values()))[0], pairs)
+    records = {(d3dlo.geometry_dtype(c), c.plane, c.spread) for c, _ in todo.values()}
+    print(f"{len(every)} runs, {len(every) - len(todo)} of them finished; {pairs:,} pairs of {root}, {steps:,} pair-steps a run; "
+          f"caches of {sum(dtype.itemsize for dtype, *_ in records) * sum(map(len, everything)) / 1e9:.1f} GB", flush=True)
     if args.dry_run:
         torch.set_num_threads(1)
-        cost = {config: seconds_a_step(config) for config in {config for config, _ in todo.values()}}
-        hours = 0
+        cost, hours = {}, 0
         for name, variants in runs.items():
             for variant, some in variants.items():
                 for config, run, seed in some:
-                    if run in todo:
-                        need = cost[config] * config.epochs * pair_steps(config, pairs) / 3600
-                        hours += need if todo.pop(run) else 0
-                        print(f"{name}: {variant}, seed {seed}: {config.epochs} epochs, {need * 60:.0f} minutes of one core -> {run}")
+                    if todo.pop(run, None):
+                        cost[config] = cost.get(config) or seconds_a_step(config)
+                        hours += cost[config] * steps / 3600
+                        print(f"{name}: {variant}, seed {seed}: {cost[config] * steps / 60:.0f} minutes of one core -> {run}", flush=True)
         print(f"{hours / args.jobs:.1f} hours with {args.jobs} at a time, and the caches")
         return 0
     for config in dict.fromkeys(replace(c, epochs=1) for c, _ in todo.values()):       # caches first, with all cores
         d3dlo.load_geometry(everything, config)
-    with ThreadPoolExecutor(args.jobs) as pool:
-        jobs = [pool.submit(run_one, run, config, root, [s.name for s in chosen], seed) for run, (config, seed) in todo.items()]
+    pool = ThreadPoolExecutor(args.jobs)
+    try:
+        jobs = [pool.submit(run_one, run, config, root, [s.name for s in chosen], names, seed) for run, (config, seed) in todo.items()]
         for job in kitti.progress(jobs, len(jobs), "trainings"):
             job.result()
+    finally:                                            # an interruption, or a run that failed: start no other
+        pool.shutdown(cancel_futures=True)
     for name, variants in runs.items():
         caption = (f"{'Simulated city' if not args.data else root}: trained on sequences {' '.join(s.name for s in chosen)} ({pairs:,} pairs), "
-                   f"{args.budget:,} pair-steps a run (the paper's are some 8 million), seeds {' '.join(map(str, args.seeds))}; "
+                   f"{steps:,} pair-steps a run (the paper's are some 8 million) by the short recipe, seeds {' '.join(map(str, args.seeds))}; "
                    "mean over the seeds, their range in brackets. Made by `python benchmarks/experiments.py " + " ".join([name, *(
                        ["--data", str(args.data)] if args.data else []), "--budget", str(args.budget), "--seeds", *map(str, args.seeds)]) + "`.")
         table(name, EXPERIMENTS[name], variants, args.out, caption)
