@@ -68,7 +68,7 @@ class Config:
     mpn: Layer = Layer(None, None, None, (64, 256))
     mlp: Layer = Layer(None, None, None, (64, 6))
 
-    spread: int = 8             # which n_n of a ball: in even steps of the nearest 8 n_n; 1: the nearest. Ours, README says why
+    spread: int = 1             # which n_n of a ball: the nearest, or in even steps of the nearest spread * n_n
     plane: bool = True          # keep the points of the ground plane, Table 2's "pp"
     epochs: int = 500           # section 4
     batch: int = 16             # pairs; ours

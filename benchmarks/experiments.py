@@ -48,7 +48,7 @@ def _name_2(n_n, plane):
 
 # experiment -> variant -> (what differs from the default Config, {split: the paper's E_t [%] and E_r [deg/m]} or its words)
 EXPERIMENTS = {
-    "grouping": {"nearest n_n": (dict(spread=1), "open"), "spread over the nearest 8 n_n": ({}, "open")},
+    "grouping": {"nearest n_n": ({}, "open"), "spread over the nearest 8 n_n": (dict(spread=8), "open")},
     "coordinates": {"Table 1": ({}, ""), "coordinates into the mini-PointNet": (dict(coordinates=True), "DeepCLR's")},
     "table2": {_name_2(*key): (_table_2(*key), {"all": paper}) for key, paper in PAPER_2.items()},
     "table3": {_name_2(*key): (_table_2(*key), dict(zip(("test", "validation"), paper))) for key, paper in PAPER_3.items()},
