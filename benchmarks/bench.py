@@ -58,9 +58,10 @@ def row(work, times, unit="ms"):
                   f"{ratio.min():.2f} to {ratio.max():.2f} | {len(ratio)} |", flush=True)
 
 
-def child(*arguments):
+def child(what, form, sequences):
     """Runs this file again for one measurement, with fresh memory and threads -> the numbers it prints."""
-    done = subprocess.run([sys.executable, __file__, "--child", *map(str, arguments)], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, __file__, "--child", what, form, str(sequences[0].folder.parents[1]), *(s.name for s in sequences)],
+                          capture_output=True, text=True)
     if done.returncode:
         sys.exit(done.stderr)
     return [float(x) for x in done.stdout.split()]
@@ -68,17 +69,11 @@ def child(*arguments):
 
 @contextmanager
 def one_core():
-    """This thread, and those it starts, stay on one core where the system can do that."""
-    cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else ()
-    if cores:
-        os.sched_setaffinity(0, {min(cores)})
+    """This thread, and those it starts, stay on one core."""
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
     yield
-    if cores:
-        os.sched_setaffinity(0, cores)
-
-
-def root_of(sequence):
-    return sequence.folder.parents[1]
+    os.sched_setaffinity(0, cores)
 
 
 # --------------------------------------------------------------------------------------------------------------------- rows
@@ -166,7 +161,7 @@ def inference(sequences):
 
 
 def compare_forms(work, what, sequences, forms, rounds):
-    times = [[child(what, form, root_of(sequences[0]), sequences[0].name)[0] for form in forms] for _ in range(rounds)]
+    times = [[child(what, form, sequences[:1])[0] for form in forms] for _ in range(rounds)]
     row(work, dict(zip(forms, np.array(times).T)))
 
 
@@ -181,13 +176,13 @@ def cache(sequences):
         kitti.cores = lambda: cores
     row(f"cache, {len(s)} scans", in_turn({"1 worker": lambda: build(1), f"{cores} workers": lambda: build(cores)}, 3), "s")
     for some in [sequences[:1]] + [sequences] * (len(sequences) > 1):
-        parent, worker = child("cache", "", root_of(s), *(x.name for x in some))
+        parent, worker = child("cache", "", some)
         print(f"cache, {sum(map(len, some))} scans: peak {parent / 2 ** 20:.2f} GB, a worker {worker / 2 ** 20:.2f} GB")
 
 
 def memory(sequences):
     """Memory of training on as many pairs as KITTI's training split, from a cache of that size; all of it is read once."""
-    peak, anonymous, size = child("memory", "", root_of(sequences[0]), sequences[0].name)
+    peak, anonymous, size = child("memory", "", sequences[:1])
     print(f"training on {KITTI_PAIRS:,} pairs, cache {size / 1e9:.2f} GB: peak resident {peak / 2 ** 20:.2f} GB, of which "
           f"{anonymous / 2 ** 20:.2f} GB memory of its own and the rest pages of the cache")
 
