@@ -27,11 +27,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import d3dlo
 import kitti
 import metrics
-from d3dlo import SHORT, Batch, Config, Layer
+from d3dlo import SHORT, Config, Layer
 
 T1 = Config()
 QUATERNION = T1.mlp._replace(mlp=(64, 7))
-NEIGHBORS = 8, 16, 32, 64, 128
 PAPER_2 = {(8, True): (2.19, 0.00855), (16, True): (2.5, 0.01015), (32, True): (2.53, 0.00937), (64, True): (3.63, 0.01483),
            (128, True): (3.04, 0.01172), (8, False): (2.29, 0.00946), (16, False): (2.76, 0.01115), (32, False): (2.28, 0.00969),
            (64, False): (2.52, 0.01057), (128, False): (2.82, 0.01192)}
@@ -127,7 +126,7 @@ def figures(run, split):
 
 def table(name, variants, runs, out, caption):
     """The Markdown table of an experiment; mean over the seeds, and their range when there are several."""
-    header = ["", "split", "parameters", "paper: E_t [%]", "E_r [deg/m]", "here: E_t [%]", "E_r [deg/m]", "step [m]", "[deg]"]
+    header = ["", "split", "parameters", "paper's E_t [%]", "paper's E_r [deg/m]", "E_t [%]", "E_r [deg/m]", "t step [m]", "r step [deg]"]
     lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
     for variant, (_, paper) in variants.items():
         config = runs[variant][0][0]
@@ -202,10 +201,15 @@ def main():
         caption = (f"{'Simulated city' if not args.data else root}: trained on sequences {' '.join(s.name for s in chosen)} ({pairs:,} pairs), "
                    f"{steps:,} pair-steps a run (the paper's are some 8 million) by the short recipe, seeds {' '.join(map(str, args.seeds))}; "
                    "mean over the seeds, their range in brackets. Made by `python benchmarks/experiments.py " + " ".join([name, *(
-                       ["--data", str(args.data)] if args.data else []), "--budget", str(args.budget), "--seeds", *map(str, args.seeds)]) + "`.")
+                       ["--data", str(args.data)] if args.data else []), *(["--sequences", *args.sequences] if args.sequences != ["train"] else []), "--budget", str(args.budget), "--seeds", *map(str, args.seeds)]) + "`.")
         table(name, EXPERIMENTS[name], variants, args.out, caption)
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except (ValueError, OSError, RuntimeError) as error:
+        sys.exit(f"experiments: {error}")
+    except KeyboardInterrupt:
+        sys.exit("\nexperiments: interrupted; the same command goes on from here")
