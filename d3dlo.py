@@ -20,11 +20,14 @@ import json
 import math
 import os
 import platform
+import signal
 import sys
+import threading
 import time
 import warnings
 import zipfile
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -687,9 +690,28 @@ def save(path, **state):
         torch.save(state, temporary)
 
 
+@contextmanager
+def interruption_waits():
+    """Ctrl-C and SIGTERM wait for the step under way: yields a list, no longer empty once one came. A second one does not wait."""
+    came, before = [], {}
+
+    def note(number, frame):
+        if came:
+            raise KeyboardInterrupt
+        came.append(number)
+    if threading.current_thread() is threading.main_thread():                                  # Python's rule for signals
+        before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield came
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=print, **remember):
-    """Train `net` by its config: Adam, eq. 2. Every five minutes and at the end writes RUN/checkpoint.pt, whose content `resume` goes on from,
-    and RUN/weights.pt, for use: with BatchNorm's statistics recomputed. `remember` is stored in both. Returns the usable net."""
+    """Train `net` by its config: Adam, eq. 2. Every five minutes, at the end and after the step under way when interrupted writes
+    RUN/checkpoint.pt, whose content `resume` goes on from; but for the last also RUN/weights.pt, for use, with BatchNorm's statistics
+    recomputed. `remember` is stored in both. Returns the usable net."""
     config, per_epoch, run = net.config, steps_per_epoch(motions, net.config), Path(run)
     total = config.epochs * per_epoch
     objective = Objective(config).to(device)
@@ -709,9 +731,11 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
     def fixed_batches():        # drawn like those of the training
         return batches(geometry, motions, config, (seed, 2 ** 31), 0, min(25, total), device)
 
-    def store():
+    def store_checkpoint():
         save(run / "checkpoint.pt", config=config.as_dict(), step=step, losses=losses, **remember,
              **{name: part.state_dict() for name, part in parts.items()})
+
+    def store_weights():
         usable.load_state_dict(net.state_dict())
         loss = recompute_statistics(usable, fixed_batches(), objective)
         save(run / "weights.pt", config=config.as_dict(), step=step, **remember, model=usable.state_dict())
@@ -719,22 +743,28 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
 
     stored = time.monotonic()
     todo = batches(geometry, motions, config, (seed,), step, total, device)
-    for batch, target in progress(todo, total - step, f"training, batches of {config.batch} pairs, swap: {config.swap}"):
-        loss = objective(net.train()(batch), target)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        rate = scheduler.get_last_lr()[0]
-        scheduler.step()
-        step += 1
-        losses.append(loss.item())
-        if step % per_epoch == 0:
-            say(f"epoch {step // per_epoch}/{config.epochs}: loss {np.mean(losses):.4f}, learning rate {rate:.1e}")
-            losses = []
-        if time.monotonic() - stored > 300:
-            store()
-            stored = time.monotonic()
-    loss_train = store()
+    with interruption_waits() as came:
+        for batch, target in progress(todo, total - step, f"training, batches of {config.batch} pairs, swap: {config.swap}"):
+            loss = objective(net.train()(batch), target)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            rate = scheduler.get_last_lr()[0]
+            scheduler.step()
+            step += 1
+            losses.append(loss.item())
+            if step % per_epoch == 0:
+                say(f"epoch {step // per_epoch}/{config.epochs}: loss {np.mean(losses):.4f}, learning rate {rate:.1e}")
+                losses = []
+            if came:
+                store_checkpoint()
+                raise KeyboardInterrupt(f"step {step} is stored; python d3dlo.py train --out {run} --resume goes on from it")
+            if time.monotonic() - stored > 300:
+                store_checkpoint()
+                store_weights()
+                stored = time.monotonic()
+        store_checkpoint()
+    loss_train = store_weights()
     loss_eval = mean_loss(usable.eval(), fixed_batches(), objective)
     say(f"loss over {min(25, total)} batches, weights fixed: {loss_train:.4f} in train mode, {loss_eval:.4f} in eval mode")
     return usable
@@ -932,8 +962,8 @@ def main(argv=None):
             if args["resume"] and any(args[k] != t.get_default(k) for k in args.keys() - {"resume", "out", "device"}):
                 raise ValueError("--resume goes on with the options the run was begun with; give only --out RUN, and --device")
             train(**args)
-    except KeyboardInterrupt:
-        print("\nd3dlo: interrupted; a training that has begun goes on by train --out RUN --resume", file=sys.stderr)
+    except KeyboardInterrupt as interruption:
+        print(f"\nd3dlo: interrupted; {interruption or 'a training that has begun goes on by train --out RUN --resume'}", file=sys.stderr)
         return 130
     except (ValueError, OSError, BrokenExecutor) as error:
         print(f"d3dlo: {error}", file=sys.stderr)

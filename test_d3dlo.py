@@ -1,6 +1,6 @@
 """Properties of D3DLO. Every expectation comes from an independent source: brute force, SciPy, a definition written out, or a closed
 form. Real data are optional: D3DLO_KITTI names a folder in KITTI odometry layout; without it those tests are skipped."""
-import json, math, os, pickle, re, runpy, shutil, subprocess, sys, types, warnings, zipfile
+import json, math, os, pickle, re, runpy, shutil, signal, subprocess, sys, types, warnings, zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -502,6 +502,26 @@ def test_a_resumed_training_ends_in_the_same_weights(tmp_path, monkeypatch, sche
     for name in ("checkpoint.pt", "weights.pt"):
         a, b = (torch.load(tmp_path / folder / name, weights_only=True) for folder in ("whole", "part"))
         assert a["step"] == b["step"] == 15 and all(torch.equal(tensor, b["model"][key]) for key, tensor in a["model"].items())
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_training_finishes_its_step_and_goes_on_as_if_nothing_had_been(tmp_path, monkeypatch, number):
+    config, count, loss = replace(SMALL, epochs=5, batch=4, augment=True), [], d3dlo.loss_unweighted
+    whole = fit(tmp_path / "whole", config)
+
+    def loss_with_a_signal(*args):
+        count.append(1)
+        if len(count) == 5:                             # of 15, in the middle of a step and of an epoch
+            os.kill(os.getpid(), number)
+        return loss(*args)
+    monkeypatch.setattr(d3dlo, "loss_unweighted", loss_with_a_signal)
+    handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    part = fit(tmp_path / "part", config)
+    assert handlers == (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) and len(count) == 5
+    state = torch.load(tmp_path / "part" / "checkpoint.pt", weights_only=True)
+    assert state["step"] == 5 and part + fit(tmp_path / "part", config, resume=state) == whole
+    a, b = (torch.load(tmp_path / folder / "weights.pt", weights_only=True)["model"] for folder in ("whole", "part"))
+    assert all(torch.equal(tensor, b[key]) for key, tensor in a.items())
 
 
 def test_resuming_a_finished_training_leaves_it_as_it_is(tmp_path):
