@@ -35,6 +35,7 @@ KITTI_PAIRS = 15960                 # of the training split
 # ---------------------------------------------------------------------------------------------------------------- measuring
 
 def seconds(work):
+    """Of one call."""
     start = time.perf_counter()
     work()
     return time.perf_counter() - start
@@ -161,6 +162,7 @@ def inference(sequences):
 
 
 def compare_forms(work, what, sequences, forms, rounds):
+    """A row for the forms of one piece of work, each measured in a process of its own, in turn."""
     times = [[child(what, form, sequences[:1])[0] for form in forms] for _ in range(rounds)]
     row(work, dict(zip(forms, np.array(times).T)))
 
@@ -210,6 +212,7 @@ ROWS = {f.__name__: f for f in (fps, geometry, odometry, training, inference, ca
 # ---------------------------------------------------------------------------------------------- one measurement in a process
 
 def child_main(what, form, root, *names):
+    """One measurement of `form` ("plain" or "here", both maybe "compiled") on sequences of ROOT -> the numbers."""
     sequences = kitti.open_sequences(root, list(names))
     if what == "cache":
         with tempfile.TemporaryDirectory() as folder:
@@ -220,6 +223,11 @@ def child_main(what, form, root, *names):
     geometry, motions = load_geometry(sequences, CONFIG, tempfile.gettempdir() + "/d3dlo-bench"), [s.motions() for s in sequences]
     torch.manual_seed(0)
     net = d3dlo.D3DLO(CONFIG)
+    return {"infer": infer, "step": time_steps, "memory": fill_memory}[what](net, forward_of(net, form), geometry, motions)
+
+
+def forward_of(net, form):
+    """Batch -> (B,6) by net's parameters, in one of the forms."""
     forward = net
     if form.startswith("plain"):
         from test_d3dlo import plain
@@ -228,44 +236,53 @@ def child_main(what, form, root, *names):
         for function in d3dlo.GatherAdd, d3dlo.LinearMax:       # loops over the batch, which a compiler would unroll
             function.apply = torch.compiler.disable(function.apply)
         forward = torch.compile(forward)
-    if what == "infer":
-        net.eval()
-        pairs = np.array([(0, i) for i in range(16)])
-        batch = training_batch(geometry, motions, pairs, CONFIG, np.random.default_rng(0))[0]
-        with torch.inference_mode():
-            return [np.median(in_turn({"": lambda: forward(batch)}, 9)[""]) / len(batch.p)]
-    optimizer = torch.optim.Adam(net.parameters())
-    steps = 16
+    return forward
 
-    def step(batch, target):
-        loss = d3dlo.loss_unweighted(forward(batch), target)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    if what == "memory":
-        with tempfile.TemporaryDirectory(dir=".") as folder:
-            file, n = Path(folder, "kitti.npy"), len(geometry[0])
-            big = np.lib.format.open_memmap(file, "w+", geometry[0].dtype, (KITTI_PAIRS + 1,))
-            for i in range(0, len(big), n):
-                big[i:i + n] = geometry[0][:len(big) - i]
-            big.flush()
-            del big
-            geometry, motions = [np.load(file, mmap_mode="r")], [np.resize(motions[0], (KITTI_PAIRS, 4, 4))]
-            for i, item in enumerate(d3dlo.batches(geometry, motions, CONFIG, (0,), 0, d3dlo.steps_per_epoch(motions, CONFIG))):
-                if i < steps:
-                    step(*item)
-            status = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
-            return [int(status[key].split()[0]) for key in ("VmHWM", "RssAnon")] + [file.stat().st_size]
-    times = []
+
+def infer(net, forward, geometry, motions):
+    """Seconds a pair, of 32."""
+    net.eval()
+    batch = training_batch(geometry, motions, np.array([(0, i) for i in range(16)]), CONFIG, np.random.default_rng(0))[0]
+    with torch.inference_mode():
+        return [np.median(in_turn({"": lambda: forward(batch)}, 9)[""]) / len(batch.p)]
+
+
+def steps(net, forward, geometry, motions, total):
+    """Trains on the first 16 of `total` batches and makes the rest; yields the seconds a pair-step of each of the 16."""
+    optimizer = torch.optim.Adam(net.parameters())
     last = time.perf_counter()
-    for item in d3dlo.batches(geometry, motions, CONFIG, (0,), 0, steps):
-        step(*item)
-        times.append(time.perf_counter() - last)
-        last = time.perf_counter()
-    return [np.median(times[4:]) / len(item[1])]        # steady: the first ones fill the allocator and compile
+    for i, (batch, target) in enumerate(d3dlo.batches(geometry, motions, CONFIG, (0,), 0, total)):
+        if i < 16:
+            loss = d3dlo.loss_unweighted(forward(batch), target)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            yield (time.perf_counter() - last) / len(target)
+            last = time.perf_counter()
+
+
+def time_steps(net, forward, geometry, motions):
+    """Seconds a pair-step, loader included, in steady state: the first steps fill the allocator and compile."""
+    return [np.median(list(steps(net, forward, geometry, motions, 16))[4:])]
+
+
+def fill_memory(net, forward, geometry, motions):
+    """Peak resident memory and its own share [kB], and the size of the cache [bytes], of training on KITTI_PAIRS pairs."""
+    with tempfile.TemporaryDirectory(dir=".") as folder:
+        file, n = Path(folder, "kitti.npy"), len(geometry[0])
+        big = np.lib.format.open_memmap(file, "w+", geometry[0].dtype, (KITTI_PAIRS + 1,))
+        for i in range(0, len(big), n):
+            big[i:i + n] = geometry[0][:len(big) - i]
+        big.flush()
+        del big
+        geometry, motions = [np.load(file, mmap_mode="r")], [np.resize(motions[0], (KITTI_PAIRS, 4, 4))]
+        list(steps(net, forward, geometry, motions, d3dlo.steps_per_epoch(motions, CONFIG)))
+        status = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
+        return [int(status[key].split()[0]) for key in ("VmHWM", "RssAnon")] + [file.stat().st_size]
 
 
 def some_scans(sequences, n):
+    """The middle scan of each of the first n sequences."""
     return [kitti.read_scan(s.scan_paths[len(s) // 2]) for s in sequences[:n]]
 
 

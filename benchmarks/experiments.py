@@ -60,7 +60,11 @@ EXPERIMENTS = {
     "swap": {"both directions": ({}, ""), "the paper's coin": (dict(swap="random", batch=2 * SHORT["batch"]), "used"),
              "forward only": (dict(swap="off", batch=2 * SHORT["batch"]), "")},
 }
-SPLITS_SHOWN = {"table2": ("all",), "table3": ("test", "validation")}       # of the others: test
+
+
+def splits_of(name):
+    """What an experiment is measured on."""
+    return {"table2": ("all",), "table3": ("test", "validation")}.get(name, ("test",))
 
 
 def pair_steps(config, pairs):
@@ -83,6 +87,7 @@ def folder_of(out, config, seed, chosen, everything):
 
 def seconds_a_step(config):
     """One core's time for a pair-step, timed on random points."""
+    torch.set_num_threads(1)
     rng, records = np.random.default_rng(0), np.zeros(config.batch + 1, d3dlo.geometry_dtype(config))
     records["xyz"] = rng.normal(size=records["xyz"].shape) * 20
     for name in d3dlo.groups(records):
@@ -111,6 +116,7 @@ def run_one(run, config, root, sequences, evaluated, seed):
 
 
 def child(run, config, root, sequences, evaluated, seed):
+    """What `run_one` runs: train, or go on, and evaluate."""
     torch.set_num_threads(1)
     d3dlo.keep_freed_memory()
     d3dlo.train(root, sequences, run, seed=seed, config=Config(**config), resume=(Path(run) / "config.json").exists())
@@ -131,7 +137,7 @@ def table(name, variants, runs, out, caption):
     for variant, (_, paper) in variants.items():
         config = runs[variant][0][0]
         parameters = sum(p.numel() for p in d3dlo.D3DLO(config).parameters())
-        for split in SPLITS_SHOWN.get(name, ("test",)):
+        for split in splits_of(name):
             seeds = np.array([figures(run, split) for _, run, _ in runs[variant]])     # (seeds,4)
             cells = [f"{c.mean():.{digits}f}" + (f" ({c.min():.{digits}f} to {c.max():.{digits}f})" if len(c) > 1 else "")
                      for c, digits in zip(seeds.T, (3, 5, 4, 4))]
@@ -141,6 +147,30 @@ def table(name, variants, runs, out, caption):
     with metrics.replacing(out / f"{name}.md") as temporary:
         temporary.write_text(text, encoding="utf-8")
     print(f"\n{text}\n{out}/{name}.md")
+
+
+def dry_run(runs, todo, steps, jobs):
+    """Say which runs of `todo` each experiment needs, and how long they take; what two of them share is counted once."""
+    cost, left, total = {}, dict(todo), 0
+    for name, variants in runs.items():
+        for variant, some in variants.items():
+            for config, run, seed in some:
+                if left.pop(run, None):
+                    cost[config] = cost.get(config) or seconds_a_step(config)
+                    total += cost[config] * steps
+                    print(f"{name}: {variant}, seed {seed}: {cost[config] * steps / 60:.0f} minutes of one core -> {run}", flush=True)
+    print(f"{total / 3600 / jobs:.1f} hours with {jobs} at a time, and the caches")
+
+
+def train_all(todo, root, sequences, evaluated, jobs):
+    """`jobs` runs at a time, each in its own process."""
+    pool = ThreadPoolExecutor(jobs)
+    try:
+        runs = [pool.submit(run_one, run, config, root, sequences, evaluated, seed) for run, (config, seed) in todo.items()]
+        for run in kitti.progress(runs, len(runs), "trainings"):
+            run.result()
+    finally:                                            # an interruption, or a run that failed: start no other
+        pool.shutdown(cancel_futures=True)
 
 
 def main():
@@ -162,7 +192,7 @@ def main():
     root = Path(args.data) if args.data else kitti.simulate(d3dlo.SIMULATED)
     everything = [s for s in kitti.open_sequences(root) if s.poses is not None]
     chosen, names = kitti.open_sequences(root, args.sequences), [s.name for s in everything]
-    for split in {split for name in args.experiments for split in SPLITS_SHOWN.get(name, ("test",))} - {"all"}:
+    for split in {split for name in args.experiments for split in splits_of(name)} - {"all"}:
         if not set(kitti.SPLITS[split]) & set(names):
             parser.error(f"{root}: none of the sequences of the {split} split ({' '.join(kitti.SPLITS[split])}), on which the table is measured")
     pairs = sum(len(s.motions()) for s in chosen)
@@ -177,32 +207,18 @@ def main():
     print(f"{len(every)} runs, {len(every) - len(todo)} of them finished; {pairs:,} pairs of {root}, {steps:,} pair-steps a run; "
           f"caches of {sum(dtype.itemsize for dtype, *_ in records) * sum(map(len, everything)) / 1e9:.1f} GB", flush=True)
     if args.dry_run:
-        torch.set_num_threads(1)
-        cost, hours = {}, 0
-        for name, variants in runs.items():
-            for variant, some in variants.items():
-                for config, run, seed in some:
-                    if todo.pop(run, None):
-                        cost[config] = cost.get(config) or seconds_a_step(config)
-                        hours += cost[config] * steps / 3600
-                        print(f"{name}: {variant}, seed {seed}: {cost[config] * steps / 60:.0f} minutes of one core -> {run}", flush=True)
-        print(f"{hours / args.jobs:.1f} hours with {args.jobs} at a time, and the caches")
+        dry_run(runs, todo, steps, args.jobs)
         return 0
-    for config in dict.fromkeys(replace(c, epochs=1) for c, _ in todo.values()):       # caches first, with all cores
+    for config in dict.fromkeys(config for config, _ in todo.values()):     # caches first, with all cores
         d3dlo.load_geometry(everything, config)
-    pool = ThreadPoolExecutor(args.jobs)
-    try:
-        jobs = [pool.submit(run_one, run, config, root, [s.name for s in chosen], names, seed) for run, (config, seed) in todo.items()]
-        for job in kitti.progress(jobs, len(jobs), "trainings"):
-            job.result()
-    finally:                                            # an interruption, or a run that failed: start no other
-        pool.shutdown(cancel_futures=True)
+    train_all(todo, root, [s.name for s in chosen], names, args.jobs)
+    repeat = [*(["--data", args.data] if args.data else []), *(["--sequences", *args.sequences] if args.sequences != ["train"] else []),
+              "--budget", str(args.budget), "--seeds", *map(str, args.seeds)]
     for name, variants in runs.items():
-        caption = (f"{'Simulated city' if not args.data else root}: trained on sequences {' '.join(s.name for s in chosen)} ({pairs:,} pairs), "
-                   f"{steps:,} pair-steps a run (the paper's are some 8 million) by the short recipe, seeds {' '.join(map(str, args.seeds))}; "
-                   "mean over the seeds, their range in brackets. Made by `python benchmarks/experiments.py " + " ".join([name, *(
-                       ["--data", str(args.data)] if args.data else []), *(["--sequences", *args.sequences] if args.sequences != ["train"] else []), "--budget", str(args.budget), "--seeds", *map(str, args.seeds)]) + "`.")
-        table(name, EXPERIMENTS[name], variants, args.out, caption)
+        table(name, EXPERIMENTS[name], variants, args.out, (
+            f"{'Simulated city' if not args.data else root}: trained on sequences {' '.join(s.name for s in chosen)} ({pairs:,} pairs), "
+            f"{steps:,} pair-steps a run (the paper's are some 8 million) by the short recipe, seeds {' '.join(map(str, args.seeds))}; "
+            f"mean over the seeds, their range in brackets. Made by `{' '.join(['python benchmarks/experiments.py', name, *repeat])}`."))
     return 0
 
 
