@@ -1,4 +1,5 @@
-"""D3DLO: Deep 3D LiDAR Odometry (Adis, Horst, Wien; ICIP 2021). Sections 3 and 4 in the paper's order.
+"""D3DLO: Deep 3D LiDAR Odometry (Adis, Horst, Wien; ICIP 2021). Sections 3 to 6 in the paper's order, but for sampling and grouping
+(3.3.2, 3.3.3), which come before the layers that use them.
 
 Two LiDAR scans in, the motion between them out: set abstraction on each scan, a flow embedding between them, two more set
 abstractions, a mini-PointNet, an MLP; 61,290 parameters. Sampling and grouping depend on no weight, so they are NumPy: those
@@ -88,14 +89,17 @@ class Config:
     coordinates: bool = False   # not in the paper, but DeepCLR's: the mini-PointNet sees where its 64 points are. 61,482 parameters
 
     def __post_init__(self):
-        for name in ("sa1", "fe", "sa2", "sa3", "mpn", "mlp"):     # json turns tuples into lists; turn them back
-            object.__setattr__(self, name, Layer(*getattr(self, name)[:3], tuple(getattr(self, name)[3])))
-        object.__setattr__(self, "scales", tuple(Layer(*layer[:3], tuple(layer[3])) for layer in self.scales))
-        if any(len(layer.mlp) < 2 for layer in (self.sa1, self.fe, self.sa2, self.sa3, self.mpn, *self.scales)):
+        def layer(r, n_fps, n_n, mlp):                          # json turns tuples into lists; turn them back
+            return Layer(r, n_fps, n_n, tuple(mlp))
+        for name in ("sa1", "fe", "sa2", "sa3", "mpn", "mlp"):
+            object.__setattr__(self, name, layer(*getattr(self, name)))
+        object.__setattr__(self, "scales", tuple(layer(*scale) for scale in self.scales))
+        grouping = (self.sa1, *self.scales, self.fe, self.sa2, self.sa3)
+        if any(len(layer.mlp) < 2 for layer in (*grouping, self.mpn)):
             raise ValueError("Config: every MLP needs at least 2 layers")
         if not 65536 > self.sa1.n_fps >= self.sa2.n_fps >= self.sa3.n_fps > 0:
             raise ValueError("Config: n_fps of sa1, sa2, sa3 must not grow, and stay below 65,536")
-        if min(self.epochs, self.batch, self.spread, *(layer.n_n for layer in (self.sa1, self.fe, self.sa2, self.sa3, *self.scales))) < 1:
+        if min(self.epochs, self.batch, self.spread, *(layer.n_n for layer in grouping)) < 1:
             raise ValueError("Config: epochs, batch, spread and every n_n must be 1 or more")
         if len(self.mlp.mlp) != 2 or self.mlp.mlp[1] not in (6, 7):
             raise ValueError("Config: mlp has two layers, the last of 6 outputs (Euler angles) or 7 (quaternion)")
@@ -140,37 +144,6 @@ def from_output(y, config):
 def loss_unweighted(y_hat, y):
     """Eq. 2: the mean absolute error over metres and degrees alike. (B,6), (B,6) -> ()."""
     return (y - y_hat).abs().mean()
-
-
-def cosine_distance(y_hat, y):
-    """Eq. 5, the mean over a batch: (B,D), (B,D) -> (). The small number gives standing still a value (1) and a gradient."""
-    return (1 - (y * y_hat).sum(1) * torch.rsqrt((y.square().sum(1) + 1e-6) * (y_hat.square().sum(1) + 1e-6))).mean()
-
-
-class Objective(nn.Module):
-    """Eq. 2, and what the paper tried beside it; see Config. Learned weights, if any, are parameters of this and not of the network."""
-
-    def __init__(self, config):
-        super().__init__()
-        self.config = config
-        if config.uncertainty:
-            self.log_variance = nn.Parameter(torch.zeros(2))                                   # of translation, rotation
-
-    def forward(self, y_hat, y):
-        """(B,6), (B,6) -> (); or (B,7), where q and -q are the same rotation."""
-        config = self.config
-        if y.shape[1] == 7:
-            sign = torch.where((y[:, 3:] * y_hat[:, 3:]).sum(1, keepdim=True) < 0, -1.0, 1.0)
-            y = torch.cat([y[:, :3], sign * y[:, 3:]], 1)
-        if config.uncertainty:
-            parts = torch.stack([loss_unweighted(y_hat[:, part], y[:, part]) for part in (slice(3), slice(3, None))])
-            loss = (torch.exp(-self.log_variance) * parts + self.log_variance).sum()           # Kendall and Cipolla 2017
-        else:
-            loss = loss_unweighted(y_hat, y)
-        if config.cosine:
-            n = 3 if config.cosine_of == "translation" else y.shape[1]
-            loss = loss + config.cosine * cosine_distance(y_hat[:, :n], y[:, :n])
-        return loss
 
 
 # ----------------------------------------------------------------------- sections 3.3.2, 3.3.3: sampling and grouping (NumPy)
@@ -280,7 +253,8 @@ def scan_geometry(scan, config=Config()):
         scan = kitti.remove_plane(scan)
     n1, (r2, n2, k2, _), (r3, n3, k3, _) = config.sa1.n_fps, config.sa2, config.sa3
     if len(scan) < n1:
-        raise ValueError(f"{len(scan)} usable points (finite, nearer than {MAX_RANGE:.0f} m{'' if config.plane else ', off the ground'}), at least {n1} are needed")
+        usable = f"finite, nearer than {MAX_RANGE:.0f} m" + ("" if config.plane else ", off the ground")
+        raise ValueError(f"{len(scan)} usable points ({usable}), at least {n1} are needed")
     cloud = np.ascontiguousarray(scan[:, :3])
     with ThreadPoolExecutor(1) as aside:
         tree = aside.submit(cKDTree, cloud, leafsize=48, balanced_tree=False, compact_nodes=False)     # quicker to build, as good to ask
@@ -436,7 +410,8 @@ def linear_norm_relu_max(linear, norm, h):
     """max over k of ReLU(BN(linear(h))): (B,S,k,D) -> (B,S,D').
 
     ReLU is increasing and BN increasing or decreasing with the sign of its scale, so the maximum is taken first: of z where that
-    is positive, of -z where it is negative. BN's statistics are still those of all neighbours; they follow from h's: mean = W E[h] + b, var = diag(W Cov[h] W^T).
+    is positive, of -z where it is negative. BN's statistics are still those of all neighbours; they follow from h's:
+    mean = W E[h] + b, var = diag(W Cov[h] W^T).
     """
     sign = torch.where(norm.weight < 0, -1.0, 1.0)
     W, b = sign[:, None] * linear.weight, sign * linear.bias
@@ -544,6 +519,41 @@ class D3DLO(nn.Module):
         return y if y.shape[1] == 6 else torch.cat([y[:, :3], F.normalize(y[:, 3:])], 1)
 
 
+# ------------------------------------------------------------- sections 3.4, 3.2: what the paper tried beside eq. 2, off by default
+
+def cosine_distance(y_hat, y):
+    """Eq. 5, the mean over a batch: (B,D), (B,D) -> (). The small number gives standing still a value (1) and a gradient."""
+    return (1 - (y * y_hat).sum(1) * torch.rsqrt((y.square().sum(1) + 1e-6) * (y_hat.square().sum(1) + 1e-6))).mean()
+
+
+class Objective(nn.Module):
+    """Eq. 2, and what the paper tried beside it; see Config. Learned weights, if any, are parameters of this and not of the network."""
+
+    def __init__(self, config):
+        super().__init__()
+        self.config = config
+        if config.uncertainty:
+            self.log_variance = nn.Parameter(torch.zeros(2))                                   # of translation, rotation
+
+    def forward(self, y_hat, y):
+        """(B,6), (B,6) -> (); or (B,7), where q and -q are the same rotation."""
+        config = self.config
+        if y.shape[1] == 7:
+            sign = torch.where((y[:, 3:] * y_hat[:, 3:]).sum(1, keepdim=True) < 0, -1.0, 1.0)
+            y = torch.cat([y[:, :3], sign * y[:, 3:]], 1)
+        if config.uncertainty:
+            parts = torch.stack([loss_unweighted(y_hat[:, part], y[:, part]) for part in (slice(3), slice(3, None))])
+            loss = (torch.exp(-self.log_variance) * parts + self.log_variance).sum()           # Kendall and Cipolla 2017
+        else:
+            loss = loss_unweighted(y_hat, y)
+        if config.cosine:
+            n = 3 if config.cosine_of == "translation" else y.shape[1]
+            loss = loss + config.cosine * cosine_distance(y_hat[:, :n], y[:, :n])
+        return loss
+
+
+# --------------------------------------------------------------------------------------------------------- odometry, eq. 1
+
 def load_weights(path=None, device="cpu"):
     """Weights file or run folder (None: those beside this file) -> (D3DLO in eval mode, the file's dict).
     The network is rebuilt from the file itself. FileNotFoundError, ValueError."""
@@ -561,8 +571,6 @@ def load_weights(path=None, device="cpu"):
         raise ValueError(f"{path}: no weights of D3DLO ({reason:.120}); give a weights.pt or a run folder") from None
     return net.eval(), state
 
-
-# --------------------------------------------------------------------------------------------------------- odometry, eq. 1
 
 @torch.inference_mode()
 def predict_motions(net, records, device="cpu", batch=16):
@@ -622,7 +630,8 @@ def augment(clouds, T_pq, rng):
 
 
 def training_batch(geometry, motions, pairs, config, rng, device="cpu"):
-    """Pairs (n,2) of (sequence, scan) -> Batch and targets (B,6) as of `to_output`. One direction is (P, Q) with T, the other (Q, P) with T^-1."""
+    """Pairs (n,2) of (sequence, scan) -> Batch and targets (B,6), see `to_output`. One direction is (P, Q) with T, the other (Q, P)
+    with T^-1."""
     clouds = np.stack([geometry[s][i + d] for d in (0, 1) for s, i in pairs])                  # (2n,): all P, all Q
     T_pq = np.stack([motions[s][i] for s, i in pairs])                                         # (n,4,4)
     if config.augment:
@@ -638,8 +647,8 @@ def training_batch(geometry, motions, pairs, config, rng, device="cpu"):
 
 
 def batches(geometry, motions, config, seed, start, stop, device="cpu"):
-    """Yields training batches number `start` to `stop` (excluded), made one ahead in a thread. Each depends on `seed` (a tuple) and its number
-    alone, so a training goes on after an interruption as if there had been none."""
+    """Yields training batches number `start` to `stop` (excluded), made one ahead in a thread. Each depends on `seed` (a tuple) and
+    its number alone, so a training goes on after an interruption as if there had been none."""
     pairs = np.array([(s, i) for s, T in enumerate(motions) for i in range(len(T))])
     per_epoch = steps_per_epoch(motions, config)
 
@@ -662,6 +671,13 @@ def batches(geometry, motions, config, seed, start, stop, device="cpu"):
 def steps_per_epoch(motions, config):
     """Batches in which all pairs come once."""
     return math.ceil(sum(map(len, motions)) / config.batch)
+
+
+def schedule(optimizer, config, steps):
+    """The learning rate over all steps: the paper's decay at 300 and 400 of 500 epochs, in proportion, or torch's one cycle."""
+    if config.schedule == "one-cycle":
+        return torch.optim.lr_scheduler.OneCycleLR(optimizer, config.lr, total_steps=steps)
+    return torch.optim.lr_scheduler.MultiStepLR(optimizer, [steps * 3 // 5, steps * 4 // 5], gamma=0.1)
 
 
 def recompute_statistics(net, batches, objective=loss_unweighted):
@@ -709,17 +725,15 @@ def interruption_waits():
 
 
 def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=print, **remember):
-    """Train `net` by its config: Adam, eq. 2. Every five minutes, at the end and after the step under way when interrupted writes
-    RUN/checkpoint.pt, whose content `resume` goes on from; but for the last also RUN/weights.pt, for use, with BatchNorm's statistics
-    recomputed. `remember` is stored in both. Returns the usable net."""
+    """Train `net` by its config: Adam, eq. 2. Returns a net for use, with BatchNorm's statistics recomputed.
+
+    Every five minutes and at the end writes RUN/checkpoint.pt, whose content `resume` goes on from, and RUN/weights.pt, the net for use,
+    with `remember` in both. When interrupted finishes its step, writes the checkpoint and raises KeyboardInterrupt."""
     config, per_epoch, run = net.config, steps_per_epoch(motions, net.config), Path(run)
     total = config.epochs * per_epoch
     objective = Objective(config).to(device)
     optimizer = torch.optim.Adam([*net.parameters(), *objective.parameters()], lr=config.lr)
-    if config.schedule == "one-cycle":
-        scheduler = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.lr, total_steps=total)
-    else:
-        scheduler = torch.optim.lr_scheduler.MultiStepLR(optimizer, [total * 3 // 5, total * 4 // 5], gamma=0.1)
+    scheduler = schedule(optimizer, config, total)
     parts = {"model": net, "objective": objective, "optimizer": optimizer, "scheduler": scheduler}
     step, losses = 0, []
     if resume:
@@ -728,8 +742,10 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
             part.load_state_dict(resume[name])
     usable = D3DLO(config).to(device)
 
+    enough = min(25, total)     # batches for the statistics, and to compare both modes on
+
     def fixed_batches():        # drawn like those of the training
-        return batches(geometry, motions, config, (seed, 2 ** 31), 0, min(25, total), device)
+        return batches(geometry, motions, config, (seed, 2 ** 31), 0, enough, device)
 
     def store_checkpoint():
         save(run / "checkpoint.pt", config=config.as_dict(), step=step, losses=losses, **remember,
@@ -766,7 +782,7 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
         store_checkpoint()
     loss_train = store_weights()
     loss_eval = mean_loss(usable.eval(), fixed_batches(), objective)
-    say(f"loss over {min(25, total)} batches, weights fixed: {loss_train:.4f} in train mode, {loss_eval:.4f} in eval mode")
+    say(f"loss over {enough} batches, weights fixed: {loss_train:.4f} in train mode, {loss_eval:.4f} in eval mode")
     return usable
 
 
@@ -945,10 +961,12 @@ def main(argv=None):
         p.add_argument("--device", default="cpu", help="cpu, cuda or mps (default: cpu)")
     t.add_argument("--out", metavar="RUN", help="folder of the run (default: runs/TIME)")
     t.add_argument("--epochs", type=positive, metavar="N", help=f"default: {Config.epochs}, short {SHORT['epochs']}")
-    t.add_argument("--batch", type=positive, metavar="N", help=f"pairs in a batch, each both ways (default: {Config.batch}, short {SHORT['batch']})")
+    t.add_argument("--batch", type=positive, metavar="N",
+                   help=f"pairs in a batch, each both ways (default: {Config.batch}, short {SHORT['batch']})")
     t.add_argument("--neighbors", type=positive, metavar="N", help=f"n_n of the first set abstraction, Table 2 (default: {Config.sa1.n_n})")
     t.add_argument("--no-plane", action="store_false", dest="plane", help="leave out the points of the ground plane, Table 2")
-    t.add_argument("--seed", type=lambda text: positive(text, 0), default=0, metavar="N", help="of the first weights, the order of pairs and the augmentation (default: 0)")
+    t.add_argument("--seed", type=lambda text: positive(text, 0), default=0, metavar="N",
+                   help="of the first weights, the order of pairs and the augmentation (default: 0)")
     t.add_argument("--short", action="store_true", help="fewer epochs, one-cycle learning rate, augmentation (always without --data)")
     t.add_argument("--resume", action="store_true", help="go on with the training in --out, with the options it was begun with")
     e.add_argument("--weights", metavar="FILE|RUN", help="weights, or folder of a run (default: those shipped)")

@@ -139,7 +139,7 @@ def table(name, variants, runs, out, caption):
         parameters = sum(p.numel() for p in d3dlo.D3DLO(config).parameters())
         for split in splits_of(name):
             seeds = np.array([figures(run, split) for _, run, _ in runs[variant]])     # (seeds,4)
-            cells = [f"{c.mean():.{digits}f}" + (f" ({c.min():.{digits}f} to {c.max():.{digits}f})" if len(c) > 1 else "")
+            cells = ["-" if np.isnan(c).any() else f"{c.mean():.{digits}f}" + (f" ({c.min():.{digits}f} to {c.max():.{digits}f})" if len(c) > 1 else "")
                      for c, digits in zip(seeds.T, (3, 5, 4, 4))]
             theirs = [f"{paper[split][0]}", f"{paper[split][1]:.5f}"] if isinstance(paper, dict) else [paper, ""]
             lines.append("| " + " | ".join([variant, split, f"{parameters:,}", *theirs, *cells]) + " |")
