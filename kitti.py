@@ -9,6 +9,7 @@ in the Velodyne frame, because that is what the points are in: T_velo = inv(Tr) 
 import argparse, functools, json, os, re, shutil, signal, sys, tempfile, time, warnings, zlib
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
@@ -386,7 +387,11 @@ def _roadside(rng, at, length, odds):
     for _ in range(int(length / 4)):  # what one sees between the houses
         s, left, house = u(0, length), rng.choice([-1, 1]) * u(20, 70), rng.random() < 0.4
         put(s, left, u(4, 12), u(4, 8), 0, u(4, 12), u(0.2, 0.4), twist=rng.normal() * 0.3) if house else tree(s, left)
-    out = np.concatenate(out)
+    return _clear_of_the_road(np.concatenate(out), at, length)
+
+
+def _clear_of_the_road(out, at, length):
+    """Prisms (n,10) -> those that do not stand on it."""
     road = np.concatenate([np.stack(at(np.arange(0, length, 1.0), left)[:2], axis=1) for left in (0, LANE)])  # (m,2) both lanes
     dx, dy = road[:, 0] - out[:, X, None], road[:, 1] - out[:, Y, None]  # (n,m)
     c, s = np.cos(out[:, YAW, None]), np.sin(out[:, YAW, None])
@@ -436,104 +441,135 @@ def _world(name, seed, scans):
     return T, prisms, moving, _ground(rng, at, length)
 
 
-def _simulate_scan(name, seed, scans, azimuth, i):
-    """Scan i of a sequence -> (N,4) float32, beam by beam from the top.
+class _Rays(NamedTuple):
+    """The rays of a scan, numbered by beam, the top one first, and by azimuth *in the world*, so that a column of rays is one line in plan."""
+    a0: float; step: float  # azimuth of the first column, and from one to the next [rad]
+    cos_a: np.ndarray; sin_a: np.ndarray  # (A,) of the columns
+    tilt: np.ndarray; gain: np.ndarray  # (A,): the ray of beam e at elevation w has sin e = gain sin(w + tilt)
+    top: np.ndarray  # (A,) slope of the highest beam
+    sin_w: np.ndarray; cos_w: np.ndarray; slope: np.ndarray  # (64 A,) of all rays
 
-    What makes it cheap: rays are numbered by beam and by their azimuth *in the world*, so a column of rays is one line in plan. A prism is cut
-    once per column, and which beams it stops follows from two heights. Roll and pitch are exact: they change the elevation, in the world,
-    of the ray that has the beam's elevation in the sensor frame and the column's azimuth in the world's."""
-    T, prisms, moving, (height, albedo, corner) = _world(name, seed, scans)
-    rng = np.random.default_rng([seed, zlib.crc32(name.encode()), i])  # of the scan, so that it does not matter who makes it
-    R, eye, f4 = T[i, :3, :3], T[i, :3, 3], np.float32
-    h, step = f4(eye[2]), 2 * np.pi / azimuth
-    # rays: with n the sensor's up in the world, the ray of beam e at azimuth a and elevation w has sin e = n . ray = gain sin(w + tilt)
+
+def _rays(R, azimuth, rng):
+    """Roll and pitch are exact: they change the elevation, in the world, of the ray that has the beam's elevation in the sensor frame and the
+    column's azimuth in the world's. With n the sensor's up in the world, sin e = n . ray."""
+    f4, step = np.float32, 2 * np.pi / azimuth
     a0 = np.arctan2(R[1, 0], R[0, 0]) + step * rng.random()
     a = a0 + step * np.arange(azimuth)
     along = R[0, 2] * np.cos(a) + R[1, 2] * np.sin(a)
-    cos_a, sin_a, tilt, gain = (v.astype(f4) for v in (np.cos(a), np.sin(a), np.arctan2(along, R[2, 2]), np.hypot(along, R[2, 2])))  # (A,)
-    w = np.arcsin(np.sin(ELEVATION[::-1]).astype(f4)[:, None] / gain) - tilt  # (64,A), the top beam first
-    top = np.tan(w[0])
-    sin_w, cos_w = np.sin(w).ravel(), np.cos(w).ravel()  # (64 A,)
-    slope = sin_w / cos_w
+    cos_a, sin_a, tilt, gain = (v.astype(f4) for v in (np.cos(a), np.sin(a), np.arctan2(along, R[2, 2]), np.hypot(along, R[2, 2])))
+    w = np.arcsin(np.sin(ELEVATION[::-1]).astype(f4)[:, None] / gain) - tilt  # (64,A)
+    sin_w, cos_w = np.sin(w).ravel(), np.cos(w).ravel()
+    return _Rays(a0, step, cos_a, sin_a, tilt, gain, np.tan(w[0]), sin_w, cos_w, sin_w / cos_w)
 
-    # prisms (n,) near enough, and the columns each can meet
-    p = np.concatenate([prisms, moving(i)])
-    p = p[np.hypot(p[:, X] - eye[0], p[:, Y] - eye[1]) - np.hypot(p[:, HALF_X], p[:, HALF_Y]) < CITY_RANGE]
+
+def _columns(p, eye, rays):
+    """Every pair (prism, column of rays that may meet it): p (n,10) -> prism (P,), column (P,)."""
     dx, dy, c, s = p[:, X] - eye[0], p[:, Y] - eye[1], np.cos(p[:, YAW]), np.sin(p[:, YAW])
-    ox, oy = -(c * dx + s * dy), s * dx - c * dy  # the eye in the prism's frame
     sx, sy = np.array([[1, 1, -1, -1], [1, -1, 1, -1]])[:, None] * p[:, [HALF_X, HALF_Y]].T[:, :, None]  # (n,4) corners
     centre = np.arctan2(dy, dx)
     wide = np.arctan2(dy[:, None] + s[:, None] * sx + c[:, None] * sy, dx[:, None] + c[:, None] * sx - s[:, None] * sy) - centre[:, None]
     wide = (wide + np.pi) % (2 * np.pi) - np.pi  # of a cylinder, these are the corners of the box around it
-    first = np.ceil((centre + wide.min(axis=1) - a0) / step).astype(int)
-    last = np.floor((centre + wide.max(axis=1) - a0) / step).astype(int)
-    inside = (np.abs(ox) < p[:, HALF_X] + 0.3) & (np.abs(oy) < p[:, HALF_Y] + 0.3)
+    first = np.ceil((centre + wide.min(axis=1) - rays.a0) / rays.step).astype(int)
+    last = np.floor((centre + wide.max(axis=1) - rays.a0) / rays.step).astype(int)
+    inside = (np.abs(c * dx + s * dy) < p[:, HALF_X] + 0.3) & (np.abs(s * dx - c * dy) < p[:, HALF_Y] + 0.3)
     count = np.where(inside, 0, last - first + 1)
-    k = np.repeat(np.arange(len(p)), count)  # (P,) the prism of every pair (prism, column)
-    col = (np.arange(len(k)) + np.repeat(first - np.cumsum(count) + count, count)) % azimuth
+    k = np.repeat(np.arange(len(p)), count)
+    return k, (np.arange(len(k)) + np.repeat(first - np.cumsum(count) + count, count)) % len(rays.cos_a)
 
-    # where the column's line enters and leaves the prism in plan, and how squarely: a box is two slabs, a cylinder a circle
-    c, s, ox, oy, hx, hy, z0, z1, dx, dy, fuzz, disc = np.stack([c, s, ox, oy, p[:, HALF_X], p[:, HALF_Y], p[:, Z0] - h, p[:, Z1] - h, dx, dy,
-                                                                 p[:, FUZZ], p[:, ROUND]]).astype(f4)[:, k]
-    ca, sa, disc = cos_a[col], sin_a[col], disc > 0
+
+def _cut(p, k, col, eye, rays):
+    """Where the line of each column enters and leaves its prism in plan [m], and how squarely: a box is two slabs, a cylinder a circle."""
+    c, s = np.cos(p[:, YAW]), np.sin(p[:, YAW])
+    dx, dy = p[:, X] - eye[0], p[:, Y] - eye[1]
+    c, s, ox, oy, hx, hy, dx, dy, disc = np.stack([c, s, -(c * dx + s * dy), s * dx - c * dy, p[:, HALF_X], p[:, HALF_Y], dx, dy,
+                                                   p[:, ROUND]]).astype(np.float32)[:, k]  # ox, oy: the eye in the prism's frame
+    ca, sa, disc = rays.cos_a[col], rays.sin_a[col], disc > 0
     with np.errstate(divide="ignore", invalid="ignore"):
         ux, uy = 1 / (c * ca + s * sa), 1 / (c * sa - s * ca)
         mx, my, rx, ry = -ox * ux, -oy * uy, hx * np.abs(ux), hy * np.abs(uy)
         middle, chord = dx * ca + dy * sa, np.sqrt(np.maximum(hx * hx - (dx * sa - dy * ca) ** 2, 0))
         enter = np.where(disc, middle - chord, np.maximum(mx - rx, my - ry))
         leave = np.where(disc, middle + chord, np.minimum(mx + rx, my + ry))
-        facing = np.where(disc, chord / hx, 1 / np.where(mx - rx > my - ry, np.abs(ux), np.abs(uy)))
+        return enter, leave, np.where(disc, chord / hx, 1 / np.where(mx - rx > my - ry, np.abs(ux), np.abs(uy)))
+
+
+def _meet_prisms(p, eye, rays, rng):
+    """What each ray meets first among the prisms: (4,64 A) distance in plan (inf: nothing), cosine of incidence, albedo, fuzz."""
+    f4, h = np.float32, np.float32(eye[2])
+    p = p[np.hypot(p[:, X] - eye[0], p[:, Y] - eye[1]) - np.hypot(p[:, HALF_X], p[:, HALF_Y]) < CITY_RANGE]
+    k, col = _columns(p, eye, rays)
+    enter, leave, facing = _cut(p, k, col, eye, rays)
+    z0, z1, fuzz = np.stack([p[:, Z0] - h, p[:, Z1] - h, p[:, FUZZ]]).astype(f4)[:, k]
     met = (enter < leave) & (enter > 0.5)
     # nothing is seen behind a prism that stops every beam of its column
-    full = met & (z0 <= 0.01 - h) & (z1 > enter * top[col]) & (fuzz == 0)
-    wall = np.full(azimuth, CITY_RANGE, f4)
+    full = met & (z0 <= 0.01 - h) & (z1 > enter * rays.top[col]) & (fuzz == 0)
+    wall = np.full(len(rays.cos_a), CITY_RANGE, f4)
     np.minimum.at(wall, col[full], enter[full])
     seen = met & (enter <= wall[col])
     k, col, enter, leave, facing, z0, z1, fuzz = (v[seen] for v in (k, col, enter, leave, facing, z0, z1, fuzz))
     # its candidate beams lie between its lowest and its highest visible edge; seen from above, the highest is the far edge of the roof
-    beam_of = lambda m: np.searchsorted(ELEVATION, np.arcsin(np.clip(gain[col] * np.sin(np.arctan(m) + tilt[col]), -1, 1)))
+    beam_of = lambda m: np.searchsorted(ELEVATION, np.arcsin(np.clip(rays.gain[col] * np.sin(np.arctan(m) + rays.tilt[col]), -1, 1)))
     low, high = beam_of(z0 / np.where(z0 > 0, leave, enter)), beam_of(z1 / np.where(z1 > 0, enter, leave))
     count = np.maximum(high - low, 0)
     g = np.repeat(np.arange(len(k)), count)  # the pair of every candidate (pair, beam)
-    ray = (63 - np.arange(len(g)) - np.repeat(low - np.cumsum(count) + count, count)) * azimuth + col[g]
+    ray = (63 - np.arange(len(g)) - np.repeat(low - np.cumsum(count) + count, count)) * len(rays.cos_a) + col[g]
     stops = (fuzz == 0)[g] | (rng.random(len(g), dtype=f4) > 0.3)  # light passes through foliage here and there
     g, ray = g[stops], ray[stops]
-    m = slope[ray]
+    m = rays.slope[ray]
     z = m * enter[g]
     above, below = z > z1[g] + 1e-3, z < z0[g] - 1e-3
     with np.errstate(divide="ignore", invalid="ignore"):
         reach = np.where(above | below, np.where(above, z1[g], z0[g]) / m, enter[g])  # if not its face, the ray meets its top or its underside
-
-    # what each ray meets first: its distance in plan, the cosine of its incidence, albedo and fuzz; prisms, then the ground
-    d, cosine, shade, blur = np.zeros((4, 64 * azimuth), f4)
+    d, cosine, shade, blur = out = np.zeros((4, len(rays.slope)), f4)
     d[:] = np.inf
     np.minimum.at(d, ray, reach)
     best = reach <= d[ray]
     hit, g, flat = ray[best], g[best], (above | below)[best]
-    cosine[hit] = np.where(flat, np.abs(sin_w[hit]), facing[g] * cos_w[hit])
+    cosine[hit] = np.where(flat, np.abs(rays.sin_w[hit]), facing[g] * rays.cos_w[hit])
     shade[hit], blur[hit] = p[k, ALBEDO].astype(f4)[g], fuzz[g]
-    aside = np.abs((a - a0 + np.pi) % (2 * np.pi) - np.pi)  # the lowest beams meet our own bonnet and boot
+    return out
+
+
+def _meet_ground(met, ground, eye, rays):
+    """Fills in, where `met` of `_meet_prisms` holds nothing, what the ray meets on the ground, unless our own car is in its way."""
+    d, cosine, shade, _ = met
+    height, albedo, corner = ground
+    f4, h, azimuth = np.float32, np.float32(eye[2]), len(rays.cos_a)
+    aside = np.abs((rays.step * np.arange(azimuth) + np.pi) % (2 * np.pi) - np.pi)  # the lowest beams meet our own bonnet and boot
     own_car = np.where(aside < 0.4, 6, np.where(aside > 2.55, 13, 0)) > np.arange(63, -1, -1)[:, None]
-    low = np.flatnonzero((d == np.inf) & (slope < -h / f4(CITY_RANGE)) & ~own_car.ravel())
-    m, col = slope[low], low % azimuth
+    low = np.flatnonzero((d == np.inf) & (rays.slope < -h / f4(CITY_RANGE)) & ~own_car.ravel())
+    m, col = rays.slope[low], low % azimuth
     flat = -h / m
     for _ in range(2):  # where it meets the plane, then where it meets the ground found there
-        cell = tuple(((e + flat * v[col]) / CELL).astype(np.int32) for e, v in zip((eye[:2] - corner).astype(f4), (cos_a, sin_a)))
+        cell = tuple(((e + flat * v[col]) / CELL).astype(np.int32) for e, v in zip((eye[:2] - corner).astype(f4), (rays.cos_a, rays.sin_a)))
         flat = (height[cell] - h) / m
-    d[low], cosine[low], shade[low] = flat, -sin_w[low], albedo[cell]
+    d[low], cosine[low], shade[low] = flat, -rays.sin_w[low], albedo[cell]
 
+
+def _simulate_scan(name, seed, scans, azimuth, i):
+    """Scan i of a sequence -> (N,4) float32, beam by beam from the top.
+
+    What makes it cheap: a column of rays is one line in plan, so a prism is cut once per column, and which beams it stops follows from
+    two heights."""
+    T, prisms, moving, ground = _world(name, seed, scans)
+    rng = np.random.default_rng([seed, zlib.crc32(name.encode()), i])  # of the scan, so that it does not matter who makes it
+    R, eye, f4 = T[i, :3, :3], T[i, :3, 3], np.float32
+    rays = _rays(R, azimuth, rng)
+    met = _meet_prisms(np.concatenate([prisms, moving(i)]), eye, rays, rng)
+    _meet_ground(met, ground, eye, rays)
     # returns: noise, drop-outs, intensity
-    ray = np.flatnonzero(d < CITY_RANGE)
+    ray = np.flatnonzero(met[0] < CITY_RANGE)
+    d, cosine, shade, blur = met[:, ray]
     noise = lambda: rng.standard_normal(len(ray), dtype=f4)
-    r = d[ray] / cos_w[ray] + 0.02 * noise() + blur[ray] * rng.random(len(ray), dtype=f4)
-    cosine, shade = cosine[ray], shade[ray]
+    r = d / rays.cos_w[ray] + 0.02 * noise() + blur * rng.random(len(ray), dtype=f4)
     lost = 0.01 + 0.10 * (r / 40) ** 2 * (0.15 / (0.05 + shade)) + 0.3 * np.exp(-cosine / 0.02) + 0.5 * np.exp(-shade / 0.03)
     light = shade * (0.65 + 0.4 * np.sqrt(cosine)) + 0.08 * noise()
     light *= rng.random(len(ray), dtype=f4) > 0.08
     back = (rng.random(len(ray), dtype=f4) > lost) & (r < CITY_RANGE) & (r > MIN_RANGE)
     ray, r, light = ray[back], r[back], light[back]
-    flat, col = r * cos_w[ray], ray % azimuth
-    x, y, z = flat * cos_a[col], flat * sin_a[col], r * sin_w[ray]  # from the eye, axes of the world
+    flat, col = r * rays.cos_w[ray], ray % azimuth
+    x, y, z = flat * rays.cos_a[col], flat * rays.sin_a[col], r * rays.sin_w[ray]  # from the eye, axes of the world
     x, y, z = (x * q[0] + y * q[1] + z * q[2] for q in R.T.astype(f4))  # R^T turns them into the sensor's; no BLAS, whose sums depend on its threads
     return np.stack([x, y, z, np.round(np.clip(light, 0, 0.99), 2)], axis=1)  # (N,4)
 
@@ -576,6 +612,35 @@ def _save_scan(path, *what):
     _simulate_scan(*what).tofile(path)
 
 
+def _calibration():
+    """Tr (4,4) and the text of calib.txt, of a camera that looks along x as KITTI's does: axes permuted, a fraction of a degree off, 8 cm lower
+    and 27 cm further ahead."""
+    Tr = np.eye(4)
+    Tr[:3, :3] = Rotation.from_euler("xyz", [0.4, -0.5, 0.3], degrees=True).as_matrix() @ [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+    Tr[:3, 3] = [-0.012, -0.076, -0.272]
+    P = [np.array([[718.856, 0, 607.193, x], [0, 718.856, 185.216, 0], [0, 0, 1, 0]]) for x in (0, -386.1, 45.4, -337.3)]
+    calib = "".join(f"{k}: {' '.join(f'{x:.12e}' for x in m.ravel())}\n" for k, m in zip(("P0", "P1", "P2", "P3", "Tr"), (*P, Tr[:3])))
+    return Tr, calib
+
+
+def _missing(root, names, seed, scans, azimuth):
+    """Sequence -> its settings, of those that are not in ROOT yet. ValueError for what is there from elsewhere or with other settings."""
+    jobs = {}
+    for name in names:
+        _check_name(name)
+        split = next((split for split in SPLITS if name in SPLITS[split]), "train")
+        settings = {"city": CITY, "seed": int(seed), "scans": int(scans or SCANS[split]), "azimuth": int(azimuth)}
+        folder, truth = root / "sequences" / name, root / "poses" / f"{name}.txt"
+        made = folder / "simulated.json"
+        if folder.exists() != made.exists() or truth.exists() and not folder.exists():
+            raise ValueError(f"{folder if folder.exists() else truth} is there already and was not simulated: choose another folder.")
+        if made.exists() and made.read_text() != json.dumps(settings):
+            raise ValueError(f"{folder} was simulated with other settings, {made.read_text()}: choose another folder.")
+        if not (made.exists() and truth.exists()):
+            jobs[name] = settings
+    return jobs
+
+
 def simulate(root, seed=0, sequences=tuple(f"{i:02d}" for i in range(11)), scans=None, azimuth=1800, workers=None):
     """Drives an HDL-64E through one simulated city per sequence and writes ROOT in KITTI's odometry layout with exact ground truth -> ROOT.
 
@@ -589,25 +654,8 @@ def simulate(root, seed=0, sequences=tuple(f"{i:02d}" for i in range(11)), scans
             raise ValueError(f"{what} is {value} but must be a whole number, {least} or more.")
     names = [sequences] if isinstance(sequences, str) else sequences
     names = dict.fromkeys(m for n in names for m in (sum(SPLITS.values(), ()) if n == "all" else SPLITS.get(n, (n,))))
-    jobs = {}  # name -> settings, of those that are not there yet
-    for name in names:
-        _check_name(name)
-        split = next((split for split in SPLITS if name in SPLITS[split]), "train")
-        settings = {"city": CITY, "seed": int(seed), "scans": int(scans or SCANS[split]), "azimuth": int(azimuth)}
-        folder, truth = root / "sequences" / name, root / "poses" / f"{name}.txt"
-        made = folder / "simulated.json"
-        if folder.exists() != made.exists() or truth.exists() and not folder.exists():
-            raise ValueError(f"{folder if folder.exists() else truth} is there already and was not simulated: choose another folder.")
-        if made.exists() and made.read_text() != json.dumps(settings):
-            raise ValueError(f"{folder} was simulated with other settings, {made.read_text()}: choose another folder.")
-        if not (made.exists() and truth.exists()):
-            jobs[name] = settings
-    # a camera that looks along x as KITTI's does: axes permuted, a fraction of a degree off, 8 cm lower and 27 cm further ahead
-    Tr = np.eye(4)
-    Tr[:3, :3] = Rotation.from_euler("xyz", [0.4, -0.5, 0.3], degrees=True).as_matrix() @ [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
-    Tr[:3, 3] = [-0.012, -0.076, -0.272]
-    P = [np.array([[718.856, 0, 607.193, x], [0, 718.856, 185.216, 0], [0, 0, 1, 0]]) for x in (0, -386.1, 45.4, -337.3)]
-    calib = "".join(f"{k}: {' '.join(f'{x:.12e}' for x in m.ravel())}\n" for k, m in zip(("P0", "P1", "P2", "P3", "Tr"), (*P, Tr[:3])))
+    jobs = _missing(root, names, seed, scans, azimuth)
+    Tr, calib = _calibration()
     (root / "sequences").mkdir(parents=True, exist_ok=True)
     (root / "poses").mkdir(exist_ok=True)
     # one name per process: two of them may fill the same ROOT, and whoever finishes a sequence first has made it
