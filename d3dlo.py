@@ -181,7 +181,7 @@ def farthest_point_sampling(xyz, n, start=0):
     farthest = nearest[:, 0].copy()                         # the largest of each run
     picks = np.empty(n, np.int64)
     picks[0] = start
-    for i in range(1, n):                                   # take and reduce: half the overhead of [] and sum, which is what counts
+    for i in range(1, n):                                   # take and reduce have less overhead than [] and sum
         p = xyz[picks[i - 1], :, None]                      # (3,1)
         gap = np.maximum(np.maximum(low - p, p - high), 0)  # (3,runs) from the pick to the box
         gap *= gap
