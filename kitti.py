@@ -247,17 +247,17 @@ def remove_plane(scan, threshold=0.15, max_tilt=15.0, hypotheses=400, subsample=
 
 
 # ---------------------------------------------------------------------------------------------------- the simulated city
-# The world is vertical prisms on a ground, one row each: yawed boxes and upright cylinders.
+# The world is vertical prisms on a ground, one row each: yawed boxes and upright cylinders. It is flat, and hills bend it afterwards.
 X, Y, YAW, HALF_X, HALF_Y, Z0, Z1, ALBEDO, FUZZ, ROUND = range(10)  # m, radians; FUZZ: depth [m] to which foliage lets light in; ROUND: a cylinder
-CITY = 1  # raise when the city changes, so that scans of two versions are never mixed
+CITY = 2  # raise when the city changes, so that scans of two versions are never mixed
 ELEVATION = np.radians(np.r_[np.linspace(-24.33, -8.83, 32), np.linspace(-8.33, 2.0, 32)])  # the HDL-64E's 64 beams, bottom to top
 SENSOR_HEIGHT, MIN_RANGE, CITY_RANGE = 1.73, 2.5, 80.0  # m
 LANE = 3.5  # m; we keep to the right lane of two, so the road reaches from 1.75 m right to 5.25 m left of our path
 CELL = 0.5  # m, of the ground's raster
 SCANS = {"train": 320, "test": 170, "validation": 170}  # per sequence: enough for 100 m segments, few enough to make on the spot
-# what a sequence is like: cruising speed [m/s], odds of a street corner every 35-80 m, stops, odds of (dense, suburban, open) surroundings
-STYLES = {"00": (12, 0.55, 0, (6, 3, 1)), "01": (19, 0.1, 0, (1, 3, 4)), "02": (15, 0.4, 0, (1, 6, 2)), "08": (12, 0.5, 1, (4, 4, 1)),
-          "09": (16, 0.35, 0, (2, 4, 3)), "03": (10, 0.5, 0, (2, 5, 2)), "04": (18.5, 0.2, 0, (3, 3, 3)), "05": (12, 0.55, 1, (6, 3, 1)),
+# what a sequence is like: cruising speed [m/s], odds of a street corner every 35-80 m (faster, further), stops, odds of (dense, suburban, open) surroundings
+STYLES = {"00": (12, 0.55, 0, (6, 3, 1)), "01": (26, 0.15, 0, (1, 3, 12)), "02": (15, 0.4, 0, (1, 6, 2)), "08": (12, 0.5, 1, (4, 4, 1)),
+          "09": (19, 0.3, 0, (1, 3, 5)), "03": (10, 0.5, 0, (2, 5, 2)), "04": (18.5, 0.2, 0, (3, 3, 3)), "05": (12, 0.55, 1, (6, 3, 1)),
           "06": (16, 0.4, 0, (3, 5, 1)), "10": (13, 0.5, 1, (2, 4, 3)), "07": (12, 0.5, 1, (6, 3, 1))}
 
 
@@ -267,7 +267,7 @@ def _drive(rng, scans, style):
     ds, start, length = 0.25, 100.0, 100 + 0.13 * cruise * scans + 150  # m; road before and behind us for what we see there
     pieces = []  # length [m], curvature [1/m], speed [m/s]: straight ahead, a bend, perhaps a street corner
     while sum(piece[0] for piece in pieces) < length:
-        stretch, speed = rng.uniform(35, 80), cruise * rng.uniform(0.75, 1.0)
+        stretch, speed = rng.uniform(35, 80) * max(cruise / 15, 1) ** 2, cruise * rng.uniform(0.75, 1.0)
         bend = rng.choice([-1, 1]) * rng.choice([0.0, rng.uniform(1.0, 2.8)]) / speed ** 2  # up to 2.8 m/s2 sideways
         arc = min(rng.uniform(0.5, 0.8) * stretch, np.radians(60) / max(abs(bend), 1e-6))
         radius, angle = rng.choice([-1, 1]) * rng.uniform(7, 12), np.radians(rng.uniform(70, 100)) * (rng.random() < corners)
@@ -313,6 +313,24 @@ def _ego(rng, at, s_of, scans):
     ahead = 0.8  # m: the Velodyne sits before the rear axle, which is what follows the road, so a turn also pushes it sideways
     T[:, :3, 3] = np.stack([x + ahead * np.cos(yaw), y + ahead * np.sin(yaw), SENSOR_HEIGHT + shake * wave(0.015, 0.3, 1.5)], axis=1)
     return T
+
+
+def _hills(rng):
+    """The land: height(x, y) [m], the sum of waves 80 to 400 m long; its slopes are some 3 % (rms)."""
+    k = 2 * np.pi / np.geomspace(80, 400, 6)  # rad/m
+    way, phase = rng.uniform(0, 2 * np.pi, (2, 6))
+    waves = np.stack([k * np.cos(way), k * np.sin(way), phase, 0.017 / k], axis=1).tolist()
+    return lambda x, y: sum(size * np.sin(kx * x + ky * y + phase) for kx, ky, phase, size in waves)
+
+
+def _uphill(T, height):
+    """Poses T_wt (n,4,4) in the flat world -> those on the hills: lifted, and tilted with the slope."""
+    x, y, d = T[:, 0, 3], T[:, 1, 3], 0.5
+    slope = np.stack([height(x, y + d) - height(x, y - d), height(x - d, y) - height(x + d, y), 0 * x], axis=1) / (2 * d)
+    out = T.copy()
+    out[:, :3, :3] = Rotation.from_rotvec(slope).as_matrix() @ T[:, :3, :3]
+    out[:, 2, 3] += height(x, y)
+    return out
 
 
 def _rows(*columns):
@@ -415,7 +433,8 @@ def _ground(rng, at, length):
 
 @functools.lru_cache(maxsize=1)
 def _world(name, seed, scans):
-    """Everything about one sequence but the sensor: T_wt (scans,4,4), prisms (n,10), moving(i) -> prisms of scan i, the ground."""
+    """Everything about one sequence but the sensor: T_wt (scans,4,4) and the same before the hills, prisms (n,10), moving(i) -> prisms of
+    scan i, the ground, the hills."""
     style = STYLES.get(name, STYLES["00"])
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])  # of the name, so that a subset of sequences gives the same files
     t = np.arange(scans + 1) * 0.1
@@ -438,7 +457,8 @@ def _world(name, seed, scans):
     def moving(i):
         k = here[:, i]
         return _cars(*at(s[k, i], left[k]), looks[:, k])
-    return T, prisms, moving, _ground(rng, at, length)
+    ground, hills = _ground(rng, at, length), _hills(rng)
+    return _uphill(T, hills), T, prisms, moving, ground, hills
 
 
 class _Rays(NamedTuple):
@@ -552,10 +572,10 @@ def _simulate_scan(name, seed, scans, azimuth, i):
 
     What makes it cheap: a column of rays is one line in plan, so a prism is cut once per column, and which beams it stops follows from
     two heights."""
-    T, prisms, moving, ground = _world(name, seed, scans)
+    T, flat, prisms, moving, ground, hills = _world(name, seed, scans)
     rng = np.random.default_rng([seed, zlib.crc32(name.encode()), i])  # of the scan, so that it does not matter who makes it
-    R, eye, f4 = T[i, :3, :3], T[i, :3, 3], np.float32
-    rays = _rays(R, azimuth, rng)
+    R, eye, f4 = T[i, :3, :3], flat[i, :3, 3], np.float32
+    rays = _rays(flat[i, :3, :3], azimuth, rng)
     met = _meet_prisms(np.concatenate([prisms, moving(i)]), eye, rays, rng)
     _meet_ground(met, ground, eye, rays)
     # returns: noise, drop-outs, intensity
@@ -564,12 +584,13 @@ def _simulate_scan(name, seed, scans, azimuth, i):
     noise = lambda: rng.standard_normal(len(ray), dtype=f4)
     r = d / rays.cos_w[ray] + 0.02 * noise() + blur * rng.random(len(ray), dtype=f4)
     lost = 0.01 + 0.10 * (r / 40) ** 2 * (0.15 / (0.05 + shade)) + 0.3 * np.exp(-cosine / 0.02) + 0.5 * np.exp(-shade / 0.03)
-    light = shade * (0.65 + 0.4 * np.sqrt(cosine)) + 0.08 * noise()
+    light = shade * (0.65 + 0.4 * np.sqrt(cosine)) + 0.08 * noise() - 0.01 * np.maximum(r - 25, 0)  # from 60 m on KITTI's are mostly 0
     light *= rng.random(len(ray), dtype=f4) > 0.08
     back = (rng.random(len(ray), dtype=f4) > lost) & (r < CITY_RANGE) & (r > MIN_RANGE)
     ray, r, light = ray[back], r[back], light[back]
-    flat, col = r * rays.cos_w[ray], ray % azimuth
-    x, y, z = flat * rays.cos_a[col], flat * rays.sin_a[col], r * rays.sin_w[ray]  # from the eye, axes of the world
+    d, col = r * rays.cos_w[ray], ray % azimuth
+    x, y, z = d * rays.cos_a[col], d * rays.sin_a[col], r * rays.sin_w[ray]  # from the eye, axes of the world
+    z += (hills(x + f4(eye[0]), y + f4(eye[1])) - hills(*eye[:2])).astype(f4)  # what a crest would hide is still seen
     x, y, z = (x * q[0] + y * q[1] + z * q[2] for q in R.T.astype(f4))  # R^T turns them into the sensor's; no BLAS, whose sums depend on its threads
     return np.stack([x, y, z, np.round(np.clip(light, 0, 0.99), 2)], axis=1)  # (N,4)
 
