@@ -76,6 +76,7 @@ class Config:
     plane: bool = True          # keep the points of the ground plane, Table 2's "pp"
     epochs: int = 500           # section 4
     batch: int = 16             # pairs; ours
+    optimizer: str = "adam"     # section 4; "muon" (ours): torch's Muon for the matrices of the hidden layers, Adam for the rest
     lr: float = 1e-3            # Adam's default; the peak of the one-cycle schedule
     schedule: str = "steps"     # x0.1 (ours) at 3/5 and 4/5 of the epochs, 300 and 400 of 500; "one-cycle": torch's OneCycleLR
     swap: str = "both"          # ours: "both" directions of every pair in a batch; "random": one of them, as in section 4; "off": forward
@@ -103,7 +104,8 @@ class Config:
             raise ValueError("Config: epochs, batch, spread and every n_n must be 1 or more")
         if len(self.mlp.mlp) != 2 or self.mlp.mlp[1] not in (6, 7):
             raise ValueError("Config: mlp has two layers, the last of 6 outputs (Euler angles) or 7 (quaternion)")
-        for name, choices in ("schedule", ("steps", "one-cycle")), ("swap", ("both", "random", "off")), ("cosine_of", ("motion", "translation")):
+        for name, choices in (("optimizer", ("adam", "muon")), ("schedule", ("steps", "one-cycle")), ("swap", ("both", "random", "off")),
+                              ("cosine_of", ("motion", "translation"))):
             if getattr(self, name) not in choices:
                 raise ValueError(f"Config.{name}: {getattr(self, name)!r} is none of {', '.join(choices)}")
 
@@ -112,7 +114,7 @@ class Config:
         return json.loads(json.dumps(asdict(self)))
 
 
-SHORT = dict(epochs=9, batch=8, lr=1e-2, schedule="one-cycle", augment=True)      # the 12-minute training on the simulated city
+SHORT = dict(epochs=9, batch=8, optimizer="muon", lr=1e-2, schedule="one-cycle", augment=True)      # the 12-minute training on the simulated city
 
 
 # ------------------------------------------------------------------------------------ sections 3.1, 3.2: problem and objective
@@ -572,23 +574,52 @@ def load_weights(path=None, device="cpu"):
     return net.eval(), state
 
 
+def moved(clouds, T):
+    """(C,) records and T (C,4,4), rigid motions or mirrors -> the records of the clouds T x. No sampling and no ball changes."""
+    out, T = clouds.copy(), T.astype(np.float32)
+    for name in ("xyz", *groups(clouds)):
+        xyz = clouds[name][..., :3]
+        out[name][..., :3] = (xyz.reshape(len(T), -1, 3) @ T[:, :3, :3].transpose(0, 2, 1)).reshape(xyz.shape)
+    out["xyz"] += T[:, None, :3, 3]
+    return out
+
+
+def both_ways(net, clouds, device):
+    """(2n,) records, the Ps and then the Qs -> T_pq (n,4,4), half-way between the answer for (P, Q) and the inverse of that for (Q, P)."""
+    p, q = np.arange(len(clouds)).reshape(2, -1)
+    y = net(make_batch(clouds, np.concatenate([p, q]), np.concatenate([q, p]), net.config, device)).cpu().numpy()
+    T, T_back = np.split(from_output(y, net.config), 2)
+    return T @ from_vector(to_vector(invert(T) @ invert(T_back)) / 2)
+
+
 @torch.inference_mode()
-def predict_motions(net, records, device="cpu", batch=16):
-    """(n,) records of consecutive scans -> (n-1,4,4) T_{t,t+1}, Velodyne frame, one forward pass a pair, SA1 once a scan."""
+def predict_motions(net, records, device="cpu", batch=16, refine=0):
+    """(n,) records of consecutive scans -> (n-1,4,4) T_{t,t+1}, Velodyne frame, one forward pass a pair, SA1 once a scan.
+
+    Not in the paper: with `refine` the network answers for both directions, and as many times again for what is left of the motion
+    once Q has been moved by the answer so far."""
     out = []
     for i in range(0, len(records) - 1, batch):
         clouds = records[i:i + batch + 1]
-        p = np.arange(len(clouds) - 1)
-        out.append(net(make_batch(clouds, p, p + 1, net.config, device)).cpu().numpy())
-    return from_output(np.concatenate(out), net.config) if out else np.empty((0, 4, 4))
+        if refine:
+            P, Q = clouds[:-1], clouds[1:]
+            T = both_ways(net, np.concatenate([P, Q]), device)
+            for _ in range(refine):
+                T = both_ways(net, np.concatenate([P, moved(Q, T)]), device) @ T
+        else:
+            p = np.arange(len(clouds) - 1)
+            T = from_output(net(make_batch(clouds, p, p + 1, net.config, device)).cpu().numpy(), net.config)
+        out.append(T)
+    return np.concatenate(out) if out else np.empty((0, 4, 4))
 
 
 class Odometry:
-    """Poses from scans, one at a time: `Odometry().register(scan)`. `weights`: a file or a run folder, None for those shipped."""
+    """Poses from scans, one at a time: `Odometry().register(scan)`. `weights`: a file or a run folder, None for those shipped;
+    `refine`: see `predict_motions`."""
 
-    def __init__(self, weights=None, device="cpu"):
+    def __init__(self, weights=None, device="cpu", refine=0):
         self.net, _ = load_weights(weights, device)
-        self.device, self.pose, self.last = device, np.eye(4), None
+        self.device, self.refine, self.pose, self.last = device, refine, np.eye(4), None
 
     def register(self, scan):
         """(N,4) float32 x, y, z [m], intensity 0..1 -> pose (4,4) float64 T_{0,t} of this scan in the first one's Velodyne frame,
@@ -598,7 +629,7 @@ class Odometry:
         if record["dropped"]:
             warnings.warn(f"left out {record['dropped']} NaN or infinite points", stacklevel=2)
         if self.last is not None:
-            self.pose = self.pose @ predict_motions(self.net, np.stack([self.last, record]), self.device)[0]
+            self.pose = self.pose @ predict_motions(self.net, np.stack([self.last, record]), self.device, refine=self.refine)[0]
         self.last = record
         return self.pose.copy()
 
@@ -614,19 +645,15 @@ def relative_pose(scan_p, scan_q, weights=None):
 # --------------------------------------------------------------------------------------------------------- section 4: training
 
 def augment(clouds, T_pq, rng):
-    """Cheap variety that changes no sampling and no ball, not in the paper: mirror half of the pairs left and right, and move Q
-    by a small random motion A, so that q' = A q and T_pq' = T_pq A^-1. (2n,) records, the Ps and then the Qs, changed in
-    place; (n,4,4) -> (n,4,4)."""
+    """Cheap variety that changes no sampling and no ball, not in the paper: mirror half of the pairs left and right, and move Q by a
+    small random motion A, so that q' = A q and T_pq' = T_pq A^-1; a quarter of the Qs first by T_pq, so that little motion is left, as
+    when `predict_motions` refines. (2n,) records, the Ps and then the Qs, (n,4,4) -> the same, changed."""
     n = len(T_pq)
-    mirrored = rng.random(n) < 0.5
-    M = np.where(mirrored[:, None, None], np.diag([1.0, -1, 1, 1]), np.eye(4))
+    M = np.where(rng.random((n, 1, 1)) < 0.5, np.diag([1.0, -1, 1, 1]), np.eye(4))
     A = from_vector(rng.normal(size=(n, 6)) * [0.25, 0.1, 0.03, 0.1, 0.1, 1.0])   # sigmas in m, degrees; most yaw, which driving has least of
-    moves = np.concatenate([M, A @ M]).astype(np.float32)                                      # (2n,4,4)
-    for name in ("xyz", *groups(clouds)):
-        xyz = clouds[name][..., :3]
-        xyz[...] = (xyz.reshape(2 * n, -1, 3) @ moves[:, :3, :3].transpose(0, 2, 1)).reshape(xyz.shape)
-    clouds["xyz"] += moves[:, None, :3, 3]
-    return M @ T_pq @ M @ invert(A)
+    T_pq = M @ T_pq @ M
+    A = A @ np.where(rng.random((n, 1, 1)) < 0.25, T_pq, np.eye(4))
+    return moved(clouds, np.concatenate([M, A @ M])), T_pq @ invert(A)
 
 
 def training_batch(geometry, motions, pairs, config, rng, device="cpu"):
@@ -635,7 +662,7 @@ def training_batch(geometry, motions, pairs, config, rng, device="cpu"):
     clouds = np.stack([geometry[s][i + d] for d in (0, 1) for s, i in pairs])                  # (2n,): all P, all Q
     T_pq = np.stack([motions[s][i] for s, i in pairs])                                         # (n,4,4)
     if config.augment:
-        T_pq = augment(clouds, T_pq, rng)
+        clouds, T_pq = augment(clouds, T_pq, rng)
     p, q, T = np.arange(len(pairs)), np.arange(len(pairs)) + len(pairs), T_pq
     if config.swap == "both":
         p, q, T = np.concatenate([p, q]), np.concatenate([q, p]), np.concatenate([T, invert(T)])
@@ -671,6 +698,16 @@ def batches(geometry, motions, config, seed, start, stop, device="cpu"):
 def steps_per_epoch(motions, config):
     """Batches in which all pairs come once."""
     return math.ceil(sum(map(len, motions)) / config.batch)
+
+
+def optimizers(net, objective):
+    """What minimises the objective: Adam (section 4), and with Config's "muon" also Muon, whose steps are as long as Adam's would be."""
+    config, parameters = net.config, [*net.parameters(), *objective.parameters()]
+    if config.optimizer == "adam":
+        return [torch.optim.Adam(parameters, config.lr)]
+    matrices = {p for p in net.parameters() if p.ndim == 2} - {net.mlp[-1].weight}
+    return [torch.optim.Adam([p for p in parameters if p not in matrices], config.lr),
+            torch.optim.Muon([p for p in parameters if p in matrices], config.lr, weight_decay=0, adjust_lr_fn="match_rms_adamw")]
 
 
 def schedule(optimizer, config, steps):
@@ -732,9 +769,10 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
     config, per_epoch, run = net.config, steps_per_epoch(motions, net.config), Path(run)
     total = config.epochs * per_epoch
     objective = Objective(config).to(device)
-    optimizer = torch.optim.Adam([*net.parameters(), *objective.parameters()], lr=config.lr)
-    scheduler = schedule(optimizer, config, total)
-    parts = {"model": net, "objective": objective, "optimizer": optimizer, "scheduler": scheduler}
+    minimizers = optimizers(net, objective)
+    schedulers = [schedule(optimizer, config, total) for optimizer in minimizers]
+    parts = {"model": net, "objective": objective, **{f"optimizer{i}": part for i, part in enumerate(minimizers)},
+             **{f"scheduler{i}": part for i, part in enumerate(schedulers)}}
     step, losses = 0, []
     if resume:
         step, losses = resume["step"], resume["losses"]
@@ -762,11 +800,12 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
     with interruption_waits() as came:
         for batch, target in progress(todo, total - step, f"training, batches of {config.batch} pairs, swap: {config.swap}"):
             loss = objective(net.train()(batch), target)
-            optimizer.zero_grad()
+            net.zero_grad()
+            objective.zero_grad()
             loss.backward()
-            optimizer.step()
-            rate = scheduler.get_last_lr()[0]
-            scheduler.step()
+            rate = schedulers[0].get_last_lr()[0]
+            for part in (*minimizers, *schedulers):
+                part.step()
             step += 1
             losses.append(loss.item())
             if step % per_epoch == 0:
@@ -788,8 +827,9 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
 
 # ----------------------------------------------------------------------------------------------- sections 5 and 6: evaluation
 
-def evaluate_network(net, state, sequences, geometry, out, source, device="cpu"):
+def evaluate_network(net, state, sequences, geometry, out, source, device="cpu", refine=0):
     """Run the network over sequences, write OUT/NN.txt (KITTI pose files) and OUT/results.json (with `source`), return the table.
+    `refine`: see `predict_motions`.
 
     Beside the network stand two trivial predictors: standing still, and the mean motion of the training set. Rows whose data
     the weights were trained on are marked, by the data's fingerprint and not by name.
@@ -798,7 +838,7 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu")
     constant = {"standing still": np.eye(4), "mean motion of training": from_vector(state["mean_motion"])}
     scores = {predictor: {} for predictor in ("network", *constant)}      # predictor -> sequence -> segment and step errors
     for s, records in progress(zip(sequences, geometry), len(sequences), "registering, sequences"):
-        motions = {"network": predict_motions(net, records, device)}
+        motions = {"network": predict_motions(net, records, device, refine=refine)}
         motions |= {name: np.broadcast_to(T, motions["network"].shape) for name, T in constant.items()}
         for predictor, T in motions.items():
             poses = accumulate(T)
@@ -891,7 +931,7 @@ def train(data=None, sequences=None, out=None, epochs=None, batch=None, neighbor
     return run
 
 
-def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu"):
+def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", refine=0):
     """The command `eval`: print the table of `weights` (None: shipped) on `sequences` of `data` (None: the simulated test and
     validation sequences). Returns the folder with trajectories and figures. ValueError, FileNotFoundError."""
     check_device(device)
@@ -902,8 +942,8 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu"):
     for s in chosen:
         if s.poses is None and (s.folder / "poses.txt").exists():
             print(f"{s.folder}/poses.txt: SemanticKITTI's, estimated by SuMa; not used, it is no ground truth", file=sys.stderr)
-    source = {"weights": str(weights or WEIGHTS), "data": str(root)}
-    print(evaluate_network(net, state, chosen, load_geometry(chosen, net.config), out, source, device))
+    source = {"weights": str(weights or WEIGHTS), "data": str(root), "refine": refine}
+    print(evaluate_network(net, state, chosen, load_geometry(chosen, net.config), out, source, device, refine))
     return out
 
 
@@ -970,6 +1010,8 @@ def main(argv=None):
     t.add_argument("--short", action="store_true", help="fewer epochs, one-cycle learning rate, augmentation (always without --data)")
     t.add_argument("--resume", action="store_true", help="go on with the training in --out, with the options it was begun with")
     e.add_argument("--weights", metavar="FILE|RUN", help="weights, or folder of a run (default: those shipped)")
+    e.add_argument("--refine", type=lambda text: positive(text, 0), default=0, metavar="N", help=(
+        "not in the paper: average both directions, and apply the network N more times to what is left (default: 0, the plain answer)"))
     e.add_argument("--out", metavar="DIR", help="folder for NN.txt and results.json (default: results/TIME)")
     args = vars(parser.parse_args(argv))
     keep_freed_memory()

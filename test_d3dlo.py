@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from hypothesis import HealthCheck, given, settings, strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from scipy.spatial.distance import cdist
 
 import d3dlo, kitti, metrics
@@ -461,9 +462,8 @@ def test_augmented_pairs_still_fit_their_motion(seed):
     rng = generator(seed)
     geometry, motions = pairs_of_scans(rng, 6, points=200, config=VARIANTS["scales"])
     assert all(g[0]["idx2"].tobytes() == g[1]["idx2"].tobytes() for g in geometry)  # Q is P moved: the same points in the same order
-    clouds, T = np.stack([g[d] for d in (0, 1) for g in geometry]), np.concatenate(motions)
-    before = clouds.copy()
-    T_new = d3dlo.augment(clouds, T, rng)
+    before, T = np.stack([g[d] for d in (0, 1) for g in geometry]), np.concatenate(motions)
+    clouds, T_new = d3dlo.augment(before, T, rng)
     for p, q, old, X, Y in zip(clouds[:6], clouds[6:], before[:6], T_new, T):
         assert_allclose(move(X, q["xyz"]), p["xyz"], atol=1e-4)
         for group in ("group", "group2", "group3"):
@@ -824,6 +824,27 @@ def test_odometry_multiplies_relative_poses_and_a_refused_scan_changes_nothing(t
         pose[:] = 0                                     # a copy: the next pose does not mind
     together = d3dlo.predict_motions(net, np.stack([scan_geometry(s, SMALL) for s in scans]), batch=3)      # and several pairs at a time
     assert_allclose(d3dlo.accumulate(together)[-1], expected, atol=1e-3)
+
+
+@given(SEED)
+def test_refining_answers_both_ways_and_again_for_what_is_left(seed):
+    rng, off = generator(seed), []
+    net, (geometry, _) = a_net(rng), pairs_of_scans(rng, 7)
+
+    def answer(p, q, **how):
+        return d3dlo.predict_motions(net, np.stack([p, q]), **how)[0]
+
+    def half_way(p, q):
+        forward, backward = answer(p, q), invert(answer(q, p))
+        T = (forward + backward) / 2
+        T[:3, :3] = Rotation.from_matrix([forward[:3, :3], backward[:3, :3]]).mean().as_matrix()
+        return T
+    for p, q in geometry:
+        first = half_way(p, q)
+        closer = d3dlo.moved(q[None], first[None])[0]                               # its own test: that of augment, which uses it
+        off.append(np.abs(answer(p, q, refine=1) - half_way(p, closer) @ first).max())
+        assert np.abs(first - answer(p, q)).max() > 1e-3                            # half-way is not the plain answer
+    assert np.median(off) < 1e-3                                                    # rounding may flip a neighbour in one or two
 
 
 def test_odometry_drops_points_that_are_not_finite_with_a_warning(tmp_path):
