@@ -22,11 +22,13 @@ import math
 import os
 import platform
 import signal
+import subprocess
 import sys
 import threading
 import time
 import warnings
 import zipfile
+import zlib
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -222,6 +224,10 @@ def group_knn(xyz, query, k):
     return np.where(idx == len(xyz), idx[:, :1], idx)
 
 
+# what tells one kind of scans from another, to say when weights meet a kind they were not trained on
+LOOKS = "usable points", "mean intensity", "median range of the centroids [m]", "share of points in the fullest 0.3 m of height, the ground"
+
+
 def geometry_dtype(config):
     """The record of one scan, all that the network needs of it."""
     (_, n1, k1, _), (_, n2, k2, _), (_, n3, k3, _) = config.sa1, config.sa2, config.sa3
@@ -230,7 +236,9 @@ def geometry_dtype(config):
                      *((f"group{i}", "f4", (n1, scale.n_n, 4)) for i, scale in enumerate(config.scales, 2)),
                      ("idx2", "u2", (n2, k2)),          # neighbours in SA2, of SA1's centroids
                      ("idx3", "u2", (n3, k3)),          # neighbours in SA3, of SA2's
-                     ("dropped", "i4")])                # NaN or infinite points left out
+                     ("dropped", "i4"),                 # NaN or infinite points left out
+                     ("looks", "f4", len(LOOKS)),
+                     ("crc", "u4")])                    # of all the bytes before
 
 
 def groups(records):
@@ -238,7 +246,7 @@ def groups(records):
     return [name for name in records.dtype.names if name.startswith("group")]
 
 
-GEOMETRY = 2    # raise when scan_geometry changes, so that older caches are not read
+GEOMETRY = 3    # raise when scan_geometry changes, so that older caches are not read
 
 
 def scan_geometry(scan, config=Config()):
@@ -270,7 +278,16 @@ def scan_geometry(scan, config=Config()):
     out["idx2"] = group_ball(xyz, np.arange(n2), r2, k2, spread=config.spread)
     out["idx3"] = group_ball(xyz[:n2], np.arange(n3), r3, k3, spread=config.spread)
     out["dropped"] = (~finite).sum()
+    layers = np.unique(np.floor(cloud[:, 2] / 0.3), return_counts=True)[1]
+    out["looks"] = len(scan), scan[:, 3].mean(), np.median(np.linalg.norm(xyz, axis=1)), layers.max() / len(scan)
+    out["crc"] = zlib.crc32(out.tobytes()[:-4])
     return out
+
+
+def unlike(looks, seen):
+    """(4,) LOOKS of a scan, (2,4) their least and most in training -> what is beyond these by more than half, in words; "" if nothing."""
+    return "; ".join(f"{name} {x:.3g} (in training {low:.3g} to {high:.3g})" for name, x, low, high in zip(LOOKS, looks, *seen)
+                     if not low / 1.5 <= x <= high * 1.5)
 
 
 def fingerprint(sequence):
@@ -289,6 +306,21 @@ def _geometry_of_file(path, config):
         raise ValueError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
 
 
+def _cached(file, dtype, n):
+    """The records of a cache file, memory-mapped and checked, or None when it is not there or damaged."""
+    if not file.is_file():
+        return None
+    try:
+        records = np.load(file, mmap_mode="r")          # runs no code: pickles are off
+        rows = records.view(np.uint8).reshape(n, -1)
+        if records.dtype == dtype and all(zlib.crc32(row[:-4]) == crc for row, crc in zip(rows, records["crc"])):
+            return records
+    except Exception:                                   # NumPy raises many kinds; here they are one
+        pass
+    print(f"{file}: damaged, it is made again", file=sys.stderr)
+    return None
+
+
 def load_geometry(sequences, config, cache="cache"):
     """List of `Sequence` -> list of (n,) arrays of records, memory-mapped from files that are made where there are none yet.
 
@@ -301,7 +333,7 @@ def load_geometry(sequences, config, cache="cache"):
         depends = (GEOMETRY, fingerprint(s), [p.stat().st_mtime_ns for p in s.scan_paths], dtype.descr, config.sa1.r, config.sa2.r,
                    config.sa3.r, [scale.r for scale in config.scales], config.spread, config.plane, MAX_RANGE)
         files.append(Path(cache) / f"{s.name}-{hashlib.sha256(repr(depends).encode()).hexdigest()[:16]}.npy")
-    missing = [(s, file) for s, file in zip(sequences, files) if not file.is_file()]
+    missing = [(s, file) for s, file in zip(sequences, files) if _cached(file, dtype, len(s)) is None]
     if missing:
         paths = [path for s, _ in missing for path in s.scan_paths]
         pool = ProcessPoolExecutor(kitti.cores(), initializer=kitti.worker_starts)
@@ -567,7 +599,7 @@ def load_weights(path=None, device="cpu"):
         state = torch.load(path, map_location=device, weights_only=True)
         net = D3DLO(Config(**state["config"])).to(device)
         net.load_state_dict(state["model"])
-        state["step"], state["train"], from_vector(state["mean_motion"])       # a KeyError when one is missing
+        state["step"], state["train"], from_vector(state["mean_motion"]), unlike(np.zeros(len(LOOKS)), state["seen"])      # KeyError, ValueError
     except Exception as error:      # torch and pickle raise many kinds; to the user they are one
         reason = f"{type(error).__name__}: {error}".splitlines()[-1].strip()
         raise ValueError(f"{path}: no weights of D3DLO ({reason:.120}); give a weights.pt or a run folder") from None
@@ -618,8 +650,8 @@ class Odometry:
     `refine`: see `predict_motions`."""
 
     def __init__(self, weights=None, device="cpu", refine=0):
-        self.net, _ = load_weights(weights, device)
-        self.device, self.refine, self.pose, self.last = device, refine, np.eye(4), None
+        self.net, state = load_weights(weights, device)
+        self.seen, self.device, self.refine, self.pose, self.last = state["seen"], device, refine, np.eye(4), None
 
     def register(self, scan):
         """(N,4) float32 x, y, z [m], intensity 0..1 -> pose (4,4) float64 T_{0,t} of this scan in the first one's Velodyne frame,
@@ -628,6 +660,9 @@ class Odometry:
         record = scan_geometry(scan, self.net.config)
         if record["dropped"]:
             warnings.warn(f"left out {record['dropped']} NaN or infinite points", stacklevel=2)
+        if self.seen and (strange := unlike(record["looks"], self.seen)):
+            warnings.warn(f"a scan unlike those the weights were trained on, do not trust the answer: {strange}", stacklevel=2)
+            self.seen = None                            # said once
         if self.last is not None:
             self.pose = self.pose @ predict_motions(self.net, np.stack([self.last, record]), self.device, refine=self.refine)[0]
         self.last = record
@@ -838,6 +873,10 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu",
     constant = {"standing still": np.eye(4), "mean motion of training": from_vector(state["mean_motion"])}
     scores = {predictor: {} for predictor in ("network", *constant)}      # predictor -> sequence -> segment and step errors
     for s, records in progress(zip(sequences, geometry), len(sequences), "registering, sequences"):
+        strange = [words for words in (unlike(looks, state["seen"]) for looks in records["looks"]) if words]
+        if strange:
+            print(f"sequence {s.name}: {len(strange)} of {len(s)} scans are unlike those the weights were trained on, do not trust the answer: "
+                  f"{strange[0]}", file=sys.stderr)
         motions = {"network": predict_motions(net, records, device, refine=refine)}
         motions |= {name: np.broadcast_to(T, motions["network"].shape) for name, T in constant.items()}
         for predictor, T in motions.items():
@@ -907,12 +946,15 @@ def train(data=None, sequences=None, out=None, epochs=None, batch=None, neighbor
     if state and state["train"] != remember["train"]:
         raise ValueError(f"{run}/checkpoint.pt: was trained on other data than lies there now; resume with the data it was begun with")
     geometry = load_geometry(chosen + held_out, config)
+    looks = np.concatenate([records["looks"] for records in geometry[:len(chosen)]])
+    remember["seen"] = [looks.min(0).tolist(), looks.max(0).tolist()]
 
     run.mkdir(parents=True, exist_ok=True)
     arguments = dict(data=data, sequences=names, seed=seed, device=device)
-    versions = {"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__, "torch": torch.__version__}
+    versions = {"d3dlo": revision(), "python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__,
+                "torch": torch.__version__}
     with metrics.replacing(run / "config.json") as temporary:
-        temporary.write_text(json.dumps(dict(arguments=arguments, config=config.as_dict(), versions=versions), indent=1) + "\n")
+        temporary.write_text(json.dumps(dict(arguments=arguments, config=config.as_dict(), versions=versions, fingerprints=remember["train"]), indent=1) + "\n")
 
     def say(line):
         print(line, flush=True)
@@ -966,6 +1008,16 @@ def keep_freed_memory():
         pass
 
 
+def revision():
+    """Git's name for the state of this code, None when it does not lie in a repository of its own."""
+    here = Path(__file__).resolve().parent
+    try:
+        git = subprocess.run(["git", "-C", here, "describe", "--always", "--dirty"], capture_output=True, text=True)
+        return git.stdout.strip() if (here / ".git").exists() else None
+    except OSError:                                     # no git
+        return None
+
+
 def begun_with(run):
     """Config, data, sequences and seed a training was begun with, from RUN/config.json."""
     try:
@@ -1015,6 +1067,7 @@ def main(argv=None):
     e.add_argument("--out", metavar="DIR", help="folder for NN.txt and results.json (default: results/TIME)")
     args = vars(parser.parse_args(argv))
     keep_freed_memory()
+    kitti.terminate_as_interrupted()
     try:
         if args.pop("command") == "eval":
             evaluate(**args)

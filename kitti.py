@@ -6,7 +6,7 @@ in the Velodyne frame, because that is what the points are in: T_velo = inv(Tr) 
 
     python kitti.py simulate DIR        # an HDL-64E driving through 11 little cities, in KITTI's layout, with exact ground truth
 """
-import argparse, functools, json, os, re, shutil, signal, sys, tempfile, time, warnings, zlib
+import argparse, functools, json, os, re, shutil, signal, sys, threading, time, warnings, zlib
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
@@ -15,7 +15,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from metrics import read_poses, write_poses
+from metrics import read_poses, temporary_beside, write_poses
 
 SPLITS = {"train": ("00", "01", "02", "08", "09"), "test": ("03", "04", "05", "06", "10"), "validation": ("07",)}  # paper, section 4
 
@@ -627,6 +627,13 @@ def cores():
 def worker_starts():
     """For the processes of a pool."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which stops its workers
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def terminate_as_interrupted():
+    """From here on SIGTERM is as Ctrl-C, which leaves through every `finally`."""
+    if threading.current_thread() is threading.main_thread():  # Python's rule for signals
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def _save_scan(path, *what):
@@ -680,14 +687,14 @@ def simulate(root, seed=0, sequences=tuple(f"{i:02d}" for i in range(11)), scans
     (root / "sequences").mkdir(parents=True, exist_ok=True)
     (root / "poses").mkdir(exist_ok=True)
     # one name per process: two of them may fill the same ROOT, and whoever finishes a sequence first has made it
-    temporary = {n: Path(tempfile.mkdtemp(prefix=f".{n}-", dir=root / "sequences")) for n in jobs if not (root / "sequences" / n).exists()}
+    temporary = {n: temporary_beside(root / "sequences" / n) for n in jobs if not (root / "sequences" / n).exists()}
     tasks = [(folder / "velodyne" / f"{i:06d}.bin", n, jobs[n]["seed"], jobs[n]["scans"], jobs[n]["azimuth"], i)
              for n, folder in temporary.items() for i in range(jobs[n]["scans"])]
     workers = int(workers or cores())
     pool = ProcessPoolExecutor(workers, initializer=worker_starts) if workers > 1 and len(tasks) > 8 else None
     try:
         for folder in temporary.values():
-            (folder / "velodyne").mkdir()
+            (folder / "velodyne").mkdir(parents=True)
         saved = progress(pool.map(_save_scan, *zip(*tasks), chunksize=8) if pool else (_save_scan(*t) for t in tasks), len(tasks), "simulating")
         for name, settings in jobs.items():
             T, folder = _world(name, settings["seed"], settings["scans"])[0], root / "sequences" / name
@@ -697,7 +704,6 @@ def simulate(root, seed=0, sequences=tuple(f"{i:02d}" for i in range(11)), scans
                 (temporary[name] / "calib.txt").write_text(calib)
                 (temporary[name] / "times.txt").write_text("".join(f"{0.1 * i:.6e}\n" for i in range(len(T))))
                 (temporary[name] / "simulated.json").write_text(json.dumps(settings))
-                temporary[name].chmod(0o755)  # it was made for our eyes only
                 try:
                     temporary[name].rename(folder)
                 except OSError:  # another process was faster
@@ -728,6 +734,7 @@ def main(argv=None):
     parser.add_argument("--scans", type=int, metavar="N", help="scans per sequence (default: 320 for training sequences, else 170)")
     parser.add_argument("--azimuth", type=int, metavar="N", default=1800, help="rays per beam and turn (default: 1800)")
     args = parser.parse_args(argv)
+    terminate_as_interrupted()
     try:
         simulate(args.dir, args.seed, args.sequences, args.scans, args.azimuth)
         made = open_sequences(args.dir, args.sequences)

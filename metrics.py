@@ -7,7 +7,10 @@ leaderboard: E_t in percent, E_r in degrees per metre.
     python metrics.py GT EST           # two pose files, or two folders of NN.txt
 """
 import argparse
+import glob
 import os
+import platform
+import shutil
 import sys
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,12 +22,29 @@ START_EVERY = 10                        # frames, devkit: step_size (one second)
 SEGMENT = np.dtype([("first", int), ("last", int), ("length", float), ("t_err", float), ("r_err", float)])
 
 
+def temporary_beside(path):
+    """A path beside `path` for this process to write to. What processes of this machine that are no more left there is removed."""
+    def runs(pid):
+        try:
+            os.kill(int(pid), 0)
+        except (ProcessLookupError, OverflowError):
+            return False
+        except (PermissionError, ValueError):               # another user's; not ours at all
+            pass
+        return True
+    prefix = f".{path.name}.{platform.node()}."
+    for left in path.parent.glob(glob.escape(prefix) + "*"):
+        if os.name == "posix" and not runs(left.name[len(prefix):]):        # elsewhere signal 0 is no question
+            shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
+    return path.with_name(prefix + str(os.getpid()))
+
+
 @contextmanager
 def replacing(path):
     """Yields a temporary path beside `path`, moved onto it when the block ends well: never a half-written file."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary = temporary_beside(path)
     try:
         yield temporary
         os.replace(temporary, path)

@@ -186,6 +186,8 @@ def test_scan_geometry_is_fps_and_grouping_of_what_is_usable(seed, spread):
     assert_array_equal(g["group"], np.concatenate([neighbours[..., :3] - xyz[picks][:, None], neighbours[..., 3:]], -1))
     assert_array_equal(g["idx2"], group_ball(xyz[picks], np.arange(16), 4.0, 8, spread=spread))
     assert_array_equal(g["idx3"], group_ball(xyz[picks[:16]], np.arange(8), 8.0, 4, spread=spread))
+    fullest = max(((xyz[:, 2] >= z) & (xyz[:, 2] < z + 0.3)).sum() for z in np.arange(-10, 10) * 0.3)
+    assert_allclose(g["looks"], [200, usable[:, 3].mean(), np.median(np.hypot(np.hypot(*g["xyz"].T[:2]), g["xyz"].T[2])), fullest / 200], rtol=0.02)
 
 
 @given(SEED)
@@ -193,7 +195,8 @@ def test_scan_geometry_knows_neither_the_order_of_points_nor_where_the_scan_is(s
     rng = generator(seed)
     scan, T = cloud(rng, 300), motion(rng, [5, 5, 1, 1, 1, 90])
     g, h = scan_geometry(scan, SMALL), scan_geometry(moved_scan(T, scan), SMALL)
-    assert scan_geometry(np.r_[scan[:1], rng.permutation(scan[1:])], SMALL).tobytes() == g.tobytes()    # FPS starts at the first point
+    shuffled = scan_geometry(np.r_[scan[:1], rng.permutation(scan[1:])], SMALL)     # FPS starts at the first point
+    assert all(shuffled[name].tobytes() == g[name].tobytes() for name in ("xyz", "group", "idx2", "idx3"))
     assert_allclose(move(T, g["xyz"]), h["xyz"], atol=1e-4)             # the same picks
     assert_array_equal(g["idx2"], h["idx2"])
     assert_allclose(g["group"][..., :3] @ T[:3, :3].T, h["group"][..., :3], atol=1e-4)
@@ -794,7 +797,8 @@ def test_a_bad_scan_leaves_nothing_in_the_cache_and_is_named(tmp_path):
 def save_weights(path, config=Config()):
     """A file as `fit` writes it, of a network that was never trained."""
     net = a_net(generator(0), config)
-    torch.save(dict(config=config.as_dict(), model=net.state_dict(), step=0, train={}, mean_motion=[1.0, 0, 0, 0, 0, 0]), path)
+    torch.save(dict(config=config.as_dict(), model=net.state_dict(), step=0, train={}, mean_motion=[1.0, 0, 0, 0, 0, 0],
+                    seen=[[1.0, 0.1, 1.0, 0.01], [1e6, 1.0, 100.0, 1.0]]), path)
     return net
 
 
