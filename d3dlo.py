@@ -50,6 +50,7 @@ from kitti import SPLITS, from_vector, invert, progress, to_vector
 
 WEIGHTS = Path(__file__).with_name("d3dlo.pt")      # the weights shipped
 SIMULATED = Path("data/simulated")                  # made under the current folder when no --data is given
+STORE_EVERY = 300.0                                 # s, from one checkpoint of a training to the next
 MAX_RANGE = 100.0                                   # m; KITTI ends at 81 m, and one stray return must not become a centroid
 
 
@@ -279,7 +280,7 @@ def scan_geometry(scan, config=Config()):
     out["idx3"] = group_ball(xyz[:n2], np.arange(n3), r3, k3, spread=config.spread)
     out["dropped"] = (~finite).sum()
     layers = np.unique(np.floor(cloud[:, 2] / 0.3), return_counts=True)[1]
-    out["looks"] = len(scan), scan[:, 3].mean(), np.median(np.linalg.norm(xyz, axis=1)), layers.max() / len(scan)
+    out["looks"] = len(scan), scan[:, 3].mean(dtype=float), np.median(np.linalg.norm(xyz, axis=1)), layers.max() / len(scan)
     out["crc"] = zlib.crc32(out.tobytes()[:-4])
     return out
 
@@ -596,6 +597,8 @@ def load_weights(path=None, device="cpu"):
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; `python d3dlo.py train` makes weights, --weights names them")
     try:
+        if zipfile.ZipFile(path).testzip():             # torch does not look at the checksums
+            raise ValueError("damaged")
         state = torch.load(path, map_location=device, weights_only=True)
         net = D3DLO(Config(**state["config"])).to(device)
         net.load_state_dict(state["model"])
@@ -799,7 +802,7 @@ def interruption_waits():
 def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=print, **remember):
     """Train `net` by its config: Adam, eq. 2. Returns a net for use, with BatchNorm's statistics recomputed.
 
-    Every five minutes and at the end writes RUN/checkpoint.pt, whose content `resume` goes on from, and RUN/weights.pt, the net for use,
+    Every STORE_EVERY seconds and at the end writes RUN/checkpoint.pt, whose content `resume` goes on from, and RUN/weights.pt, the net for use,
     with `remember` in both. When interrupted finishes its step, writes the checkpoint and raises KeyboardInterrupt."""
     config, per_epoch, run = net.config, steps_per_epoch(motions, net.config), Path(run)
     total = config.epochs * per_epoch
@@ -849,7 +852,7 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
             if came:
                 store_checkpoint()
                 raise KeyboardInterrupt(f"step {step} is stored; python d3dlo.py train --out {run} --resume goes on from it")
-            if time.monotonic() - stored > 300:
+            if time.monotonic() - stored > STORE_EVERY:
                 store_checkpoint()
                 store_weights()
                 stored = time.monotonic()

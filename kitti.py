@@ -57,17 +57,23 @@ def read_calib(path):
     except ValueError:
         Tr = np.full((4, 4), np.nan)
     R = Tr[:3, :3]
-    if not (np.isfinite(Tr).all() and np.abs(R @ R.T - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0):
+    with np.errstate(all="ignore"):  # of absurd numbers
+        right = np.isfinite(Tr).all() and np.abs(R @ R.T - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0
+    if not right:
         raise ValueError(f"{path}: the row 'Tr' must be 12 finite numbers, a rotation and a translation: {get}.")
     return Tr
 
 
 def read_times(path):
     """times.txt -> (n,) float64, seconds since the first scan. Raises FileNotFoundError, or ValueError when it holds anything but numbers."""
+    words = _read(path, "it comes with the odometry calibration archive (data_odometry_calib.zip)").split()
     try:
-        return np.array(_read(path, "it comes with the odometry calibration archive (data_odometry_calib.zip)").split(), dtype=float)
+        times = np.array(words, dtype=float)
     except ValueError:
-        raise ValueError(f"{path} must hold one number (seconds) a line: unpack the odometry calibration archive again.") from None
+        times = np.array([np.nan])
+    if not np.isfinite(times).all():
+        raise ValueError(f"{path} must hold one number (seconds) a line: unpack the odometry calibration archive again.")
+    return times
 
 
 # --------------------------------------------------------------------------------------------------------------- frames

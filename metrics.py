@@ -73,7 +73,8 @@ def read_poses(path):
     T = np.tile(np.eye(4), (len(rows), 1, 1))                                       # (n,4,4)
     T[:, :3] = np.reshape(rows, (-1, 3, 4))
     R = T[:, :3, :3]
-    rigid = (np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) < 1e-2) & (np.linalg.det(R) > 0)
+    with np.errstate(all="ignore"):                         # of absurd numbers
+        rigid = (np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) < 1e-2) & (np.linalg.det(R) > 0)
     if not rigid.all():
         raise ValueError(f"{path}: pose {np.argmin(rigid)} (from 0) is no rigid motion: its left 3x3 block is not a rotation")
     return T
