@@ -342,11 +342,11 @@ def load_geometry(sequences, config, cache="cache"):
             records = pool.map(partial(_geometry_of_file, config=config), paths, chunksize=4)
             records = progress(records, len(paths), "sampling and grouping, scans")
             for s, file in missing:
-                with metrics.replacing(file) as temporary:
-                    out = np.lib.format.open_memmap(temporary, "w+", dtype, (len(s),))
-                    for i in range(len(s)):
-                        out[i] = next(records)
-                    out.flush()
+                shape = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": (len(s),)}
+                with metrics.replacing(file) as temporary, open(temporary, "wb") as out:       # a full disk would end a memory map's process
+                    np.lib.format.write_array_header_1_0(out, shape)
+                    for _ in range(len(s)):
+                        out.write(next(records).tobytes())
             next(records, None)                         # lets the progress line end
         finally:
             pool.shutdown(cancel_futures=True)
@@ -619,11 +619,18 @@ def moved(clouds, T):
     return out
 
 
+def answer(net, clouds, p, q, device):
+    """(C,) records, (B,) and (B,) indices of them -> T_pq (B,4,4). ValueError when the network gives no numbers."""
+    y = net(make_batch(clouds, p, q, net.config, device)).cpu().numpy()
+    if not np.isfinite(y).all():
+        raise ValueError("the network's answer is not finite; are the intensities between 0 and 1?")
+    return from_output(y, net.config)
+
+
 def both_ways(net, clouds, device):
     """(2n,) records, the Ps and then the Qs -> T_pq (n,4,4), half-way between the answer for (P, Q) and the inverse of that for (Q, P)."""
     p, q = np.arange(len(clouds)).reshape(2, -1)
-    y = net(make_batch(clouds, np.concatenate([p, q]), np.concatenate([q, p]), net.config, device)).cpu().numpy()
-    T, T_back = np.split(from_output(y, net.config), 2)
+    T, T_back = np.split(answer(net, clouds, np.concatenate([p, q]), np.concatenate([q, p]), device), 2)
     return T @ from_vector(to_vector(invert(T) @ invert(T_back)) / 2)
 
 
@@ -643,7 +650,7 @@ def predict_motions(net, records, device="cpu", batch=16, refine=0):
                 T = both_ways(net, np.concatenate([P, moved(Q, T)]), device) @ T
         else:
             p = np.arange(len(clouds) - 1)
-            T = from_output(net(make_batch(clouds, p, p + 1, net.config, device)).cpu().numpy(), net.config)
+            T = answer(net, clouds, p, p + 1, device)
         out.append(T)
     return np.concatenate(out) if out else np.empty((0, 4, 4))
 
@@ -778,7 +785,10 @@ def mean_loss(net, batches, objective=loss_unweighted):
 def save(path, **state):
     """A dictionary of tensors and plain values to a file, through a temporary one."""
     with metrics.replacing(path) as temporary:
-        torch.save(state, temporary)
+        try:
+            torch.save(state, temporary)
+        except RuntimeError as error:                   # torch's word for a full disk
+            raise OSError(f"{path}: not written ({str(error).splitlines()[0]:.80})") from None
 
 
 @contextmanager
@@ -899,7 +909,8 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu",
     parts = {split: names for split, names in splits.items() if names} | {"all": list(known)}
     each = {name: summary([name]) for name in known}
     pooled = {group: {p: summary(names, p) for p in scores} for group, names in parts.items()}
-    results = {**source, "sequences": each, "splits": {g: p["network"] for g, p in pooled.items() if g != "all"},
+    lengths = metrics.by_length([segments for segments, _ in scores["network"].values()])
+    results = {**source, "sequences": each, "lengths": lengths, "splits": {g: p["network"] for g, p in pooled.items() if g != "all"},
                "pooled": pooled["all"]["network"], "predictors": {c: {g: p[c] for g, p in pooled.items()} for c in constant}}
     plain = json.loads(json.dumps(results), parse_constant=lambda nan: None)    # JSON has no NaN
     with metrics.replacing(out / "results.json") as temporary:
@@ -914,6 +925,7 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu",
     rows = [metrics.row(name + " *" * s["trained_on"], s) for name, s in each.items()]
     for group, predictions in pooled.items():
         rows += [metrics.row(group + " *" * s["trained_on"] if p == "network" else f"  {p}", s) for p, s in predictions.items()]
+    rows += [metrics.row(length, s) for length, s in lengths.items()]
     return (metrics.table(metrics.HEADER, rows) + "\n*: trained on. E_t, E_r: KITTI's segments of 100 to 800 m, rectified left camera "
             "frame. t step, r step: mean length and\nangle of inv(T_est) @ T_true of a step, Velodyne frame. -: no such segment, or no "
             f"ground truth.\n{written}")

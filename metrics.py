@@ -172,6 +172,12 @@ def summary(segments, steps):
     return {"E_t": E_t, "E_r": E_r, "t_step_m": t, "r_step_deg": r, "segments": sum(map(len, segments))}
 
 
+def by_length(segments):
+    """List of `segment_errors` -> {"100 m": summary, ...} of the lengths there are."""
+    pooled = np.concatenate([np.empty(0, SEGMENT), *segments])
+    return {f"{m} m": summary([pooled[pooled["length"] == m]], []) for m in LENGTHS if m in pooled["length"]}
+
+
 def row(name, s):
     """A `summary` as a row of a table under HEADER."""
     return [name, s["segments"], f"{s['E_t']:.3f}", f"{s['E_r']:.5f}", f"{s['t_step_m']:.4f}", f"{s['r_step_deg']:.4f}"]
@@ -208,10 +214,10 @@ def main(argv=None):
     except (ValueError, OSError) as error:
         print(f"metrics.py: {error}", file=sys.stderr)
         return 2
-    pooled, blank = np.concatenate(all_segments), ["-"] * 3
+    blank = ["-"] * 3
     if len(rows) > 1:
         rows.append(row("all", summary(all_segments, all_steps)) + blank)
-    rows += [row(f"{m} m", summary([pooled[pooled["length"] == m]], [])) + blank for m in LENGTHS if m in pooled["length"]]
+    rows += [row(length, s) + blank for length, s in by_length(all_segments).items()]
     print(table([*HEADER, "ATE [m]", "RPE [m]", "RPE [deg]"], rows))
     print("E_t, E_r: KITTI devkit, mean over segments of 100..800 m of path. t step, r step: mean error of a step. ATE, RPE: rmse as"
           "\nevo_ape kitti / evo_rpe kitti print it without flags (no alignment, delta one frame; degrees with -r angle_deg)."

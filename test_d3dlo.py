@@ -784,6 +784,32 @@ def test_the_cache_holds_what_scan_geometry_says_and_is_made_anew_when_anything_
     assert len(load(unlike)) == 17                      # what it does not depend on
 
 
+@given(at=st.floats(0, 1), cut=st.booleans())
+@settings(max_examples=20)
+def test_a_damaged_cache_is_made_again(tmp_path, at, cut):
+    there = (tmp_path / "root").exists()                # hypothesis calls this again in the same folder
+    sequences = kitti.open_sequences(tmp_path / "root" if there else
+                                     write_root(tmp_path / "root", ("00",), size=60))
+    load_geometry(sequences, SMALL, tmp_path / "cache")
+    file, = (tmp_path / "cache").iterdir()
+    good = file.read_bytes()
+    at = int(at * (len(good) - 1))
+    file.write_bytes(good[:at] if cut else good[:at] + bytes([good[at] ^ 16]) + good[at + 1:])
+    load_geometry(sequences, SMALL, tmp_path / "cache")
+    assert file.read_bytes() == good and len(list((tmp_path / "cache").iterdir())) == 1
+
+
+def test_temporaries_of_dead_processes_go_and_those_of_living_ones_stay(tmp_path):
+    dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True).stdout.strip()
+    mine = metrics.temporary_beside(tmp_path / "a.npy")
+    left = {pid: mine.with_name(mine.name.replace(str(os.getpid()), pid)) for pid in (dead, "1", "no-pid")}
+    other = mine.with_name(f".b.npy.{dead}")
+    for path in (*left.values(), other):
+        path.write_text("")
+    assert metrics.temporary_beside(tmp_path / "a.npy") == mine
+    assert sorted(tmp_path.iterdir()) == sorted([left["1"], left["no-pid"], other])
+
+
 def test_a_bad_scan_leaves_nothing_in_the_cache_and_is_named(tmp_path):
     root, cache = write_root(tmp_path / "root", scans=8, size=60), tmp_path / "cache"
     cloud(generator(0), 20).tofile(root / "sequences" / "00" / "velodyne" / "000005.bin")
@@ -792,13 +818,23 @@ def test_a_bad_scan_leaves_nothing_in_the_cache_and_is_named(tmp_path):
     assert list(cache.iterdir()) == []
 
 
+def test_times_must_be_numbers(tmp_path):
+    for text, n in (("0 0.1\n0.2\n", 3), ("", 0), ("0\nnan\n", None), ("inf", None), ("zero", None)):
+        (tmp_path / "times.txt").write_text(text)
+        if n is None:
+            with pytest.raises(ValueError, match="times.txt"):
+                kitti.read_times(tmp_path / "times.txt")
+        else:
+            assert len(kitti.read_times(tmp_path / "times.txt")) == n
+
+
 # --------------------------------------------------------------------------------------------------- weights and odometry
 
-def save_weights(path, config=Config()):
+def save_weights(path, config=Config(), seen=([1.0, 0.1, 1.0, 0.01], [1e6, 1.0, 100.0, 1.0])):
     """A file as `fit` writes it, of a network that was never trained."""
     net = a_net(generator(0), config)
     torch.save(dict(config=config.as_dict(), model=net.state_dict(), step=0, train={}, mean_motion=[1.0, 0, 0, 0, 0, 0],
-                    seen=[[1.0, 0.1, 1.0, 0.01], [1e6, 1.0, 100.0, 1.0]]), path)
+                    seen=seen), path)
     return net
 
 
@@ -857,6 +893,70 @@ def test_odometry_drops_points_that_are_not_finite_with_a_warning(tmp_path):
     expected = d3dlo.relative_pose(p, q, tmp_path / "w.pt")
     with pytest.warns(UserWarning, match="1 NaN"):
         assert_array_equal(d3dlo.relative_pose(p, np.insert(q, 7, np.nan, axis=0), tmp_path / "w.pt"), expected)
+
+
+SCENES = {  # scans (N,4) of which the default network must make a finite motion
+    "an empty field": lambda rng: np.c_[rng.uniform(-50, 50, (5000, 2)), np.full(5000, -1.73), np.full(5000, 0.3)],
+    "a corridor": lambda rng: np.c_[rng.uniform(-80, 80, 5000), rng.choice([-2, 2], 5000), rng.uniform(-1, 2, 5000), np.full(5000, 0.3)],
+    "exactly 1,024 points": lambda rng: cloud(rng, 1024),
+    "all points at one place": lambda rng: np.ones((2000, 4)),
+    "all points at the sensor": lambda rng: np.zeros((2000, 4)),
+    "1,000,000 points": lambda rng: cloud(rng, 1_000_000),
+    "absurd intensities": lambda rng: cloud(rng, 2000) * np.float32([1, 1, 1, 3e38]),
+}
+
+
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
+def test_degenerate_scenes_end_in_a_finite_motion_or_a_refusal(tmp_path, scene):
+    save_weights(tmp_path / "w.pt")
+    p = scene(generator(0)).astype(np.float32)
+    for q in (p, moved_scan(from_vector([0, 0, 0, 0, 0, 180]), p)):                 # standing still, turned round
+        for refine in (0, 1):
+            odometry = d3dlo.Odometry(tmp_path / "w.pt", refine=refine)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)
+                odometry.register(p)
+                if scene is SCENES["absurd intensities"]:
+                    with pytest.raises(ValueError, match="intensities"):
+                        odometry.register(q)
+                    continue
+                pose = odometry.register(q)
+            assert np.isfinite(pose).all()
+            assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
+
+
+def test_poses_are_rotations_after_100000_steps(tmp_path, monkeypatch):
+    save_weights(tmp_path / "w.pt", SMALL)
+    odometry, T = d3dlo.Odometry(tmp_path / "w.pt"), motion(generator(0), n=100)
+    odometry.register(cloud(generator(0), 60))
+    record, steps = odometry.last, iter(range(100_000))
+    monkeypatch.setattr(d3dlo, "scan_geometry", lambda *scan: record)
+    monkeypatch.setattr(d3dlo, "predict_motions", lambda *pair, **how: T[next(steps) % 100][None])
+    for _ in range(100_000):
+        pose = odometry.register(None)
+    assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
+    assert abs(np.linalg.det(pose[:3, :3]) - 1) < 1e-9
+
+
+@given(st.lists(st.floats(0.1, 10), min_size=4, max_size=4), st.lists(st.floats(1, 5), min_size=4, max_size=4))
+def test_what_is_unlike_is_named(share, spread):
+    low, high = np.arange(1.0, 5), np.arange(1.0, 5) * spread
+    looks = low * share
+    for name, x, a, b in zip(d3dlo.LOOKS, looks, low, high):
+        assert (name in d3dlo.unlike(looks, [low, high])) == (x < a / 1.5 or x > b * 1.5)
+
+
+def test_odometry_and_eval_say_once_when_scans_are_unlike_those_of_the_training(here, capsys):
+    root, scans = write_root(here / "root", ("00",)), [cloud(generator(i), 1100) for i in range(3)]
+    save_weights(here / "w.pt", seen=[[1e5, 0.1, 1, 0.01], [2e5, 1, 100, 1]])
+    with pytest.warns(UserWarning, match="usable points 1.1e.03 .in training 1e.05") as said:
+        odometry = d3dlo.Odometry(here / "w.pt")
+        for scan in scans:
+            odometry.register(scan)
+    assert len(said) == 1
+    assert d3dlo.main(["eval", "--data", str(root), "--weights", "w.pt", "--out", "out"]) == 0
+    line, = complaint(capsys.readouterr().err)
+    assert "sequence 00" in line and "usable points" in line
 
 
 # ---------------------------------------------------------------------------------------------------------- command line
