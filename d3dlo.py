@@ -875,9 +875,9 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
 
 # ----------------------------------------------------------------------------------------------- sections 5 and 6: evaluation
 
-def evaluate_network(net, state, sequences, geometry, out, source, device="cpu", refine=0):
+def evaluate_network(net, state, sequences, geometry, out, source, device="cpu", refine=0, plot=False):
     """Run the network over sequences, write OUT/NN.txt (KITTI pose files) and OUT/results.json (with `source`), return the table.
-    `refine`: see `predict_motions`.
+    `refine`: see `predict_motions`; `plot`: draw OUT/plot.png, see `metrics.draw`.
 
     Beside the network stand two trivial predictors: standing still, and the mean motion of the training set. Rows whose data
     the weights were trained on are marked, by the data's fingerprint and not by name.
@@ -885,6 +885,7 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu",
     out = Path(out)
     constant = {"standing still": np.eye(4), "mean motion of training": from_vector(state["mean_motion"])}
     scores = {predictor: {} for predictor in ("network", *constant)}      # predictor -> sequence -> segment and step errors
+    trajectories = {}                                                      # sequence -> true and estimated poses, camera frame
     for s, records in progress(zip(sequences, geometry), len(sequences), "registering, sequences"):
         strange = [words for words in (unlike(looks, state["seen"]) for looks in records["looks"]) if words]
         if strange:
@@ -897,6 +898,7 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu",
             poses_cam = kitti.velo_to_camera(poses, s.Tr)
             if predictor == "network":
                 metrics.write_poses(out / f"{s.name}.txt", poses_cam)
+                trajectories[s.name] = s.poses_cam, poses_cam
             if s.poses is not None:
                 scores[predictor][s.name] = metrics.segment_errors(s.poses_cam, poses_cam), metrics.step_errors(s.poses, poses)
     known = {s.name: fingerprint(s) in state["train"].values() for s in sequences}
@@ -916,6 +918,9 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu",
     with metrics.replacing(out / "results.json") as temporary:
         temporary.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
     written = f"trajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)\nfigures       {out}/results.json"
+    if plot:
+        metrics.draw(out / "plot.png", trajectories)
+        written += f"\npicture       {out}/plot.png (from above in the camera's frame, errors by length)"
     server = [f"{i}.txt" for i in range(11, 22)]                # KITTI's sequences without ground truth
     if {Path(name).stem for name in server} <= set(known):
         with metrics.replacing(out / "kitti-server.zip") as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -988,7 +993,7 @@ def train(data=None, sequences=None, out=None, epochs=None, batch=None, neighbor
     return run
 
 
-def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", refine=0):
+def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", refine=0, plot=False):
     """The command `eval`: print the table of `weights` (None: shipped) on `sequences` of `data` (None: the simulated test and
     validation sequences). Returns the folder with trajectories and figures. ValueError, FileNotFoundError."""
     check_device(device)
@@ -1000,7 +1005,7 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
         if s.poses is None and (s.folder / "poses.txt").exists():
             print(f"{s.folder}/poses.txt: SemanticKITTI's, estimated by SuMa; not used, it is no ground truth", file=sys.stderr)
     source = {"weights": str(weights or WEIGHTS), "data": str(root), "refine": refine}
-    print(evaluate_network(net, state, chosen, load_geometry(chosen, net.config), out, source, device, refine))
+    print(evaluate_network(net, state, chosen, load_geometry(chosen, net.config), out, source, device, refine, plot))
     return out
 
 
@@ -1079,6 +1084,7 @@ def main(argv=None):
     e.add_argument("--weights", metavar="FILE|RUN", help="weights, or folder of a run (default: those shipped)")
     e.add_argument("--refine", type=lambda text: positive(text, 0), default=0, metavar="N", help=(
         "not in the paper: average both directions, and apply the network N more times to what is left (default: 0, the plain answer)"))
+    e.add_argument("--plot", action="store_true", help="draw the paths and the errors by length; needs matplotlib")
     e.add_argument("--out", metavar="DIR", help="folder for NN.txt and results.json (default: results/TIME)")
     args = vars(parser.parse_args(argv))
     keep_freed_memory()

@@ -183,6 +183,33 @@ def row(name, s):
     return [name, s["segments"], f"{s['E_t']:.3f}", f"{s['E_r']:.5f}", f"{s['t_step_m']:.4f}", f"{s['r_step_deg']:.4f}"]
 
 
+def draw(path, trajectories):
+    """{name: (T_gt or None, T_est)} in KITTI's camera frame -> a PNG, for each name a row: the path from above, and KITTI's errors by the
+    length of the segments. ValueError without matplotlib."""
+    try:
+        from matplotlib.figure import Figure                # without pyplot no display is needed
+    except ImportError:
+        raise ValueError("a picture needs matplotlib: pip install \".[plot]\"") from None
+    figure = Figure(figsize=(10.5, 3.1 * len(trajectories)), layout="constrained")
+    rows = figure.subplots(len(trajectories), 3, squeeze=False)
+    for (name, (T_gt, T_est)), (above, *errors) in zip(trajectories.items(), rows):
+        for T, style in (T_gt, dict(color="0.65", lw=4, label="truth")), (T_est, dict(color="black", lw=1.2, label="estimate")):
+            if T is not None:
+                above.plot(T[:, 0, 3], T[:, 2, 3], **style)  # KITTI's camera: x right, z forward
+        above.plot(0, 0, "ko", ms=5)
+        above.set(title=f"{name} from above, from the dot", xlabel="x [m]", ylabel="z [m]", aspect="equal", adjustable="datalim")
+        above.legend(frameon=False)
+        lengths = by_length([] if T_gt is None else [segment_errors(T_gt, T_est)])
+        for axis, error, unit in zip(errors, ("E_t", "E_r"), ("%", "deg/m")):
+            axis.plot([int(m.split()[0]) for m in lengths], [s[error] for s in lengths.values()], "ko-")
+            axis.set(title=f"{name}: {error} by length" + " (no segment)" * (not lengths), xlabel="length of the segments [m]",
+                     ylabel=f"{error} [{unit}]", xlim=(50, 850), ylim=(0, 1.15 * max((s[error] for s in lengths.values()), default=0) or 1))
+    for axis in rows.flat:
+        axis.grid(color="0.9")
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=100)
+
+
 def _pairs_of_files(gt, est):
     if gt.is_dir() != est.is_dir():
         raise ValueError(f"{gt} and {est}: give two pose files or two folders of NN.txt, not one of each")
@@ -198,11 +225,12 @@ def main(argv=None):
     """The command line -> exit code."""
     parser = argparse.ArgumentParser(
         description="KITTI's odometry errors of trajectories.\n\n  python metrics.py poses/00.txt results/00.txt\n"
-        "  python metrics.py poses results", formatter_class=argparse.RawDescriptionHelpFormatter)
+        "  python metrics.py poses results --plot results/plot.png", formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("gt", metavar="GT", type=Path, help="ground truth: a pose file, or a folder of NN.txt")
     parser.add_argument("est", metavar="EST", type=Path, help="estimate: likewise")
+    parser.add_argument("--plot", metavar="PNG", type=Path, help="draw the paths and the errors by length; needs matplotlib")
     args = parser.parse_args(argv)
-    rows, all_segments, all_steps = [], [], []
+    rows, all_segments, all_steps, trajectories = [], [], [], {}
     try:
         for name, files in _pairs_of_files(args.gt, args.est).items():
             T_gt, T_est = map(read_poses, files)
@@ -211,6 +239,9 @@ def main(argv=None):
             segments, steps, ate = segment_errors(T_gt, T_est), step_errors(T_gt, T_est), rmse(absolute_errors(T_gt, T_est))
             rows.append(row(name, summary([segments], [steps])) + [f"{ate:.3f}", f"{rmse(steps[:, 0]):.4f}", f"{rmse(steps[:, 1]):.4f}"])
             all_segments.append(segments), all_steps.append(steps)
+            trajectories[name] = T_gt, T_est
+        if args.plot:
+            draw(args.plot, trajectories)
     except (ValueError, OSError) as error:
         print(f"metrics.py: {error}", file=sys.stderr)
         return 2
@@ -221,7 +252,7 @@ def main(argv=None):
     print(table([*HEADER, "ATE [m]", "RPE [m]", "RPE [deg]"], rows))
     print("E_t, E_r: KITTI devkit, mean over segments of 100..800 m of path. t step, r step: mean error of a step. ATE, RPE: rmse as"
           "\nevo_ape kitti / evo_rpe kitti print it without flags (no alignment, delta one frame; degrees with -r angle_deg)."
-          "\nAll in the frame of the files: KITTI's is the rectified left camera.")
+          "\nAll in the frame of the files: KITTI's is the rectified left camera." + (f"\n{args.plot}" if args.plot else ""))
     return 0
 
 

@@ -1160,3 +1160,30 @@ def test_as_a_user_sees_it(tmp_path, weights):
     rewrite(SCAN, lambda b: b[:16 * 1000])(write_root(tmp_path / "root"))
     code, out, err = user(HERE / "d3dlo.py", "eval", "--data", "root", "--weights", weights)
     assert (code, out, len(complaint(err))) == (2, "", 1) and SCAN in complaint(err)[0]
+
+
+def test_spawned_workers_foreign_letters_no_home_and_a_folder_one_may_not_write_to(tmp_path, weights):
+    here = tmp_path / "o\u00f9 \u00e7a \u6f22"
+    write_root(here / "data")
+    for folder in (here / "data").rglob("*"):
+        folder.chmod(0o555 if folder.is_dir() else 0o444)
+    (here / "run.py").write_text(
+        "import multiprocessing, sys, d3dlo\nif __name__ == '__main__':\n    multiprocessing.set_start_method('spawn')\n"
+        f"    sys.exit(d3dlo.main(['eval', '--data', 'data', '--weights', {str(weights)!r}, '--out', 'o\u00f9']))\n", encoding="utf-8")
+    ran = subprocess.run([sys.executable, "run.py"], cwd=here, capture_output=True, timeout=300, stdin=subprocess.DEVNULL,
+                         env={"PATH": os.environ.get("PATH", ""), "PYTHONPATH": str(HERE), "LC_ALL": "C"})
+    assert ran.returncode == 0 and not complaint(ran.stderr.decode()) and len(list((here / "o\u00f9").glob("*.txt"))) == 2, ran
+
+
+def test_pictures_are_drawn_where_there_is_matplotlib(tmp_path, monkeypatch):
+    T = d3dlo.accumulate(motion(generator(0), [1, 0.1, 0.1, 0.1, 0.1, 1], n=150))
+    metrics.write_poses(tmp_path / "gt.txt", T), metrics.write_poses(tmp_path / "est.txt", T)
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)                     # as if it were not installed
+    with pytest.raises(ValueError, match="matplotlib"):
+        metrics.draw(tmp_path / "a.png", {"00": (T, T)})
+    assert not (tmp_path / "a.png").exists()
+    monkeypatch.undo()
+    pytest.importorskip("matplotlib")
+    assert metrics.main([str(tmp_path / "gt.txt"), str(tmp_path / "est.txt"), "--plot", str(tmp_path / "a.png")]) == 0
+    metrics.draw(tmp_path / "b.png", {"11": (None, T)})                             # without ground truth
+    assert all((tmp_path / name).read_bytes().startswith(b"\x89PNG") for name in ("a.png", "b.png"))
