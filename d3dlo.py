@@ -279,8 +279,9 @@ def scan_geometry(scan, config=Config()):
     out["idx2"] = group_ball(xyz, np.arange(n2), r2, k2, spread=config.spread)
     out["idx3"] = group_ball(xyz[:n2], np.arange(n3), r3, k3, spread=config.spread)
     out["dropped"] = (~finite).sum()
-    layers = np.unique(np.floor(cloud[:, 2] / 0.3), return_counts=True)[1]
-    out["looks"] = len(scan), scan[:, 3].mean(dtype=float), np.median(np.linalg.norm(xyz, axis=1)), layers.max() / len(scan)
+    layer = np.floor(cloud[:, 2] / 0.3).astype(int)
+    ground = np.bincount(layer - layer.min()).max() / len(scan)
+    out["looks"] = len(scan), scan[:, 3].mean(dtype=float), np.median(np.linalg.norm(xyz, axis=1)), ground
     out["crc"] = zlib.crc32(out.tobytes()[:-4])
     return out
 
