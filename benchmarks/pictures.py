@@ -57,7 +57,7 @@ def method(root, name, i):
     for y in near:
         flow.plot([xyz[one, 1], y[1]], [xyz[one, 0], y[0]], color="0.2", lw=0.7)
     flow.legend(frameon=False, loc="upper right")
-    window(flow, xyz[one], 1.3 * np.abs(near - xyz[one])[:, :2].max(), f"FE: {config.fe.n_n} neighbours in the next scan")
+    window(flow, xyz[one], 1.3 * np.abs(near - xyz[one])[:, :2].max(), f"FE: {config.fe.n_n} neighbours in Q")
     return figure
 
 
