@@ -1,5 +1,7 @@
-"""D3DLO: Deep 3D LiDAR Odometry (Adis, Horst, Wien; ICIP 2021). Sections 3 to 6 in the paper's order, but for sampling and grouping
-(3.3.2, 3.3.3), which come before the layers that use them.
+"""D3DLO: Deep 3D LiDAR Odometry (Adis, Horst, Wien; ICIP 2021)
+
+Sections 3 to 6 in the paper's order, but for sampling and grouping (3.3.2, 3.3.3), which come before the layers that use them, and after the
+network what the paper tried and left (3.2, 3.4) and odometry (eq. 1).
 
 Two LiDAR scans in, the motion between them out: set abstraction on each scan, a flow embedding between them, two more set
 abstractions, a mini-PointNet, an MLP; 61,290 parameters. Sampling and grouping depend on no weight, so they are NumPy: those
@@ -14,21 +16,7 @@ B pairs of scans, C clouds (scans) in a batch, D features.
     python d3dlo.py train --data ROOT           # KITTI odometry, the paper's schedule
     python d3dlo.py eval --data ROOT            # with the weights beside this file
 """
-import argparse
-import ctypes
-import hashlib
-import json
-import math
-import os
-import platform
-import signal
-import subprocess
-import sys
-import threading
-import time
-import warnings
-import zipfile
-import zlib
+import argparse, ctypes, hashlib, json, math, platform, signal, subprocess, sys, threading, time, warnings, zipfile, zlib
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -153,7 +141,7 @@ def loss_unweighted(y_hat, y):
 
 # ----------------------------------------------------------------------- sections 3.3.2, 3.3.3: sampling and grouping (NumPy)
 
-RUN = 192       # points in a run of neighbours; 128 to 256 are as fast
+CHUNK = 192     # points in a chunk of neighbours; 128 to 256 are as fast
 SPACED = np.array([int(f"{i:b}", 4) for i in range(256)], np.uint16)        # the bits of a byte, moved apart to every second place
 
 
@@ -171,35 +159,35 @@ def farthest_point_sampling(xyz, n, start=0):
     """Exact farthest point sampling: (N,3) -> (n,) int64 indices. Each pick is the point farthest from all picks before it.
 
     Ties go to the lowest index (so picks repeat when fewer than n points differ). Nested: the first m picks are what n = m gives.
-    The cloud is cut into runs of neighbours, and a pick can only bring nearer the points of runs whose bounding box is nearer to it
-    than the run's farthest point is to the picks so far. All other runs are left alone. ValueError when there are fewer than n points.
+    The cloud is cut into chunks of neighbours. A pick can shorten distances only in chunks whose bounding box is nearer to it than
+    the chunk's largest distance left; all others are skipped. ValueError when there are fewer than n points.
     """
     xyz = np.asarray(xyz)
     if not (0 < n <= len(xyz) and 0 <= start < len(xyz)):
         raise ValueError(f"farthest point sampling of {n} among {len(xyz)} points from {start}: n must be 1 to {len(xyz)}, start below that")
     xyz = np.asarray(xyz, np.float32 if xyz.dtype == np.float32 else np.float64)
     order = _side_by_side(xyz)
-    order = np.pad(order, (0, -len(order) % RUN), mode="edge").reshape(-1, RUN)                # (runs,RUN), the last one padded
-    points = np.ascontiguousarray(xyz[order].transpose(0, 2, 1))                               # (runs,3,RUN)
-    low, high = points.min(2).T.copy(), points.max(2).T.copy()                                 # (3,runs) boxes
+    order = np.pad(order, (0, -len(order) % CHUNK), mode="edge").reshape(-1, CHUNK)            # (chunks,CHUNK), the last one padded
+    points = np.ascontiguousarray(xyz[order].transpose(0, 2, 1))                               # (chunks,3,CHUNK)
+    low, high = points.min(2).T.copy(), points.max(2).T.copy()                                 # (3,chunks) boxes
     nearest = np.full(order.shape, np.inf, xyz.dtype)       # squared distance of each point to the picks so far
-    farthest = nearest[:, 0].copy()                         # the largest of each run
+    farthest = nearest[:, 0].copy()                         # the largest of each chunk
     picks = np.empty(n, np.int64)
     picks[0] = start
     for i in range(1, n):                                   # take and reduce have less overhead than [] and sum
         p = xyz[picks[i - 1], :, None]                      # (3,1)
-        gap = np.maximum(np.maximum(low - p, p - high), 0)  # (3,runs) from the pick to the box
+        gap = np.maximum(np.maximum(low - p, p - high), 0)  # (3,chunks) from the pick to the box
         gap *= gap
-        runs = (np.add.reduce(gap, 0) < farthest).nonzero()[0]
-        d = points.take(runs, 0)                            # (k,3,RUN), summed in the same order as the gap, so that rounding agrees
+        chunks = (np.add.reduce(gap, 0) < farthest).nonzero()[0]
+        d = points.take(chunks, 0)                          # (k,3,CHUNK), summed in the same order as the gap, so that rounding agrees
         d -= p
         d *= d
-        d = np.minimum(np.add.reduce(d, 1), nearest.take(runs, 0))
-        nearest[runs] = d
-        farthest[runs] = np.maximum.reduce(d, 1)
-        runs = (farthest == np.maximum.reduce(farthest)).nonzero()[0]
-        d = nearest.take(runs, 0)
-        picks[i] = order.take(runs, 0)[d == np.maximum.reduce(d, None)].min()
+        d = np.minimum(np.add.reduce(d, 1), nearest.take(chunks, 0))
+        nearest[chunks] = d
+        farthest[chunks] = np.maximum.reduce(d, 1)
+        chunks = (farthest == np.maximum.reduce(farthest)).nonzero()[0]
+        d = nearest.take(chunks, 0)
+        picks[i] = order.take(chunks, 0)[d == np.maximum.reduce(d, None)].min()
     return picks
 
 
@@ -231,20 +219,15 @@ LOOKS = "usable points", "mean intensity", "median range of the centroids [m]", 
 
 def geometry_dtype(config):
     """The record of one scan, all that the network needs of it."""
-    (_, n1, k1, _), (_, n2, k2, _), (_, n3, k3, _) = config.sa1, config.sa2, config.sa3
+    n1, (_, n2, k2, _), (_, n3, k3, _) = config.sa1.n_fps, config.sa2, config.sa3
+    k1 = sum(scale.n_n for scale in (config.sa1, *config.scales))
     return np.dtype([("xyz", "f4", (n1, 3)),            # centroids of SA1, of which the first n2 and n3 are those of SA2 and SA3
-                     ("group", "f4", (n1, k1, 4)),      # their neighbours: offset [m] and intensity
-                     *((f"group{i}", "f4", (n1, scale.n_n, 4)) for i, scale in enumerate(config.scales, 2)),
-                     ("idx2", "u2", (n2, k2)),          # neighbours in SA2, of SA1's centroids
-                     ("idx3", "u2", (n3, k3)),          # neighbours in SA3, of SA2's
+                     ("group", "f4", (n1, k1, 4)),      # their neighbours, scale by scale: offset [m] and intensity
+                     ("idx2", "u2", (n2, k2)),          # of SA2's centroids: neighbours among SA1's
+                     ("idx3", "u2", (n3, k3)),          # of SA3's: among SA2's
                      ("dropped", "i4"),                 # NaN or infinite points left out
                      ("looks", "f4", len(LOOKS)),
                      ("crc", "u4")])                    # of all the bytes before
-
-
-def groups(records):
-    """The names of the groups in records, one for each scale of SA1."""
-    return [name for name in records.dtype.names if name.startswith("group")]
 
 
 GEOMETRY = 3    # raise when scan_geometry changes, so that older caches are not read
@@ -252,19 +235,20 @@ GEOMETRY = 3    # raise when scan_geometry changes, so that older caches are not
 
 def scan_geometry(scan, config=Config()):
     """Sampling and grouping of all three set abstractions: scan (N,4) -> record of `geometry_dtype`. FPS is nested, so one
-    sampling serves them all. Points that are not finite or beyond MAX_RANGE are left out; ValueError when too few remain."""
-    scan = np.asarray(scan)
+    sampling serves them all. Points that are not finite or beyond MAX_RANGE are left out, and of absurd intensity; ValueError when too few remain."""
+    with np.errstate(over="ignore"):
+        scan = np.asarray(scan, np.float32)
     if scan.ndim != 2 or scan.shape[1] != 4:
         raise ValueError(f"a scan has the shape (N, 4): x, y, z [m] and intensity, not {scan.shape}")
     x, y, z, intensity = scan.T
     with np.errstate(over="ignore", invalid="ignore"):
-        finite = np.isfinite(x + y + z + intensity)
-        scan = np.ascontiguousarray(scan[finite & (x * x + y * y + z * z < MAX_RANGE ** 2)], np.float32)
+        finite = np.isfinite(x + y + z) & (np.abs(intensity) < 65536)       # no sensor gives more; it would end as NaN
+        scan = np.ascontiguousarray(scan[finite & (x * x + y * y + z * z < MAX_RANGE ** 2)])
     if not config.plane:
         scan = kitti.remove_plane(scan)
     n1, (r2, n2, k2, _), (r3, n3, k3, _) = config.sa1.n_fps, config.sa2, config.sa3
     if len(scan) < n1:
-        usable = f"finite, nearer than {MAX_RANGE:.0f} m" + ("" if config.plane else ", off the ground")
+        usable = f"finite, nearer than {MAX_RANGE:.0f} m, intensity below 65,536" + ("" if config.plane else ", off the ground")
         raise ValueError(f"{len(scan)} usable points ({usable}), at least {n1} are needed")
     cloud = np.ascontiguousarray(scan[:, :3])
     with ThreadPoolExecutor(1) as aside:
@@ -272,10 +256,9 @@ def scan_geometry(scan, config=Config()):
         centroids = farthest_point_sampling(cloud, n1)
     out = np.empty((), geometry_dtype(config))
     out["xyz"] = xyz = cloud[centroids]                                                        # (n1,3)
-    for name, scale in zip(groups(out), (config.sa1, *config.scales)):
-        group = scan[group_ball(cloud, centroids, scale.r, scale.n_n, tree.result(), config.spread)]   # (n1,k1,4)
-        group[..., :3] -= xyz[:, None]
-        out[name] = group
+    balls = [group_ball(cloud, centroids, scale.r, scale.n_n, tree.result(), config.spread) for scale in (config.sa1, *config.scales)]
+    out["group"] = scan[np.concatenate(balls, 1)]                                              # (n1,k1,4)
+    out["group"][..., :3] -= xyz[:, None]
     out["idx2"] = group_ball(xyz, np.arange(n2), r2, k2, spread=config.spread)
     out["idx3"] = group_ball(xyz[:n2], np.arange(n3), r3, k3, spread=config.spread)
     out["dropped"] = (~finite).sum()
@@ -287,7 +270,7 @@ def scan_geometry(scan, config=Config()):
 
 
 def unlike(looks, seen):
-    """(4,) LOOKS of a scan, (2,4) their least and most in training -> what is beyond these by more than half, in words; "" if nothing."""
+    """(4,) LOOKS of a scan, (2,4) their least and most in training -> what is beyond these by more than a factor of 1.5, in words."""
     return "; ".join(f"{name} {x:.3g} (in training {low:.3g} to {high:.3g})" for name, x, low, high in zip(LOOKS, looks, *seen)
                      if not low / 1.5 <= x <= high * 1.5)
 
@@ -333,7 +316,7 @@ def load_geometry(sequences, config, cache="cache"):
     files = []
     for s in sequences:
         depends = (GEOMETRY, fingerprint(s), [p.stat().st_mtime_ns for p in s.scan_paths], dtype.descr, config.sa1.r, config.sa2.r,
-                   config.sa3.r, [scale.r for scale in config.scales], config.spread, config.plane, MAX_RANGE)
+                   config.sa3.r, [(scale.r, scale.n_n) for scale in config.scales], config.spread, config.plane, MAX_RANGE)
         files.append(Path(cache) / f"{s.name}-{hashlib.sha256(repr(depends).encode()).hexdigest()[:16]}.npy")
     missing = [(s, file) for s, file in zip(sequences, files) if _cached(file, dtype, len(s)) is None]
     if missing:
@@ -362,7 +345,7 @@ def load_geometry(sequences, config, cache="cache"):
 class Batch(NamedTuple):
     """C clouds and B pairs (p, q) of them, as tensors."""
     xyz: torch.Tensor       # (C,n1,3)
-    group: tuple            # of tensors (C,n1,k1,4), one for each scale of SA1
+    group: torch.Tensor     # (C,n1,k1,4)
     idx2: torch.Tensor      # (C,n2,k2)
     idx3: torch.Tensor      # (C,n3,k3)
     p: torch.Tensor         # (B,) the cloud that is P
@@ -376,29 +359,18 @@ def make_batch(clouds, p, q, config, device="cpu"):
 
     def tensor(array):
         return torch.from_numpy(np.ascontiguousarray(array)).to(device)
-    return Batch(tensor(clouds["xyz"]), tuple(tensor(clouds[name]) for name in groups(clouds)), tensor(clouds["idx2"].astype(np.int64)),
+    return Batch(tensor(clouds["xyz"]), tensor(clouds["group"]), tensor(clouds["idx2"].astype(np.int64)),
                  tensor(clouds["idx3"].astype(np.int64)), tensor(p), tensor(q), tensor(idx_fe))
 
 
 # --------------------------------------------------------------------------------------------- section 3.3: the network (torch)
 
-class GatherAdd(torch.autograd.Function):
-    """u (B,n,D), v (B,S,D), idx (B,S,k) -> u[b, idx] + v[:, :, None] (B,S,k,D), written out because torch's own backward of
-    indexing is slow on a CPU."""
-
-    @staticmethod
-    def forward(ctx, u, v, idx):
-        (B, n, D), k = u.shape, idx.shape[2]
-        rows = (idx + n * torch.arange(B, device=idx.device)[:, None, None]).view(-1, 1)       # (B*S*k,1)
-        ctx.save_for_backward(rows)
-        ctx.n = n
-        return u.reshape(B * n, D).gather(0, rows.expand(-1, D)).view(B, -1, k, D).add_(v[:, :, None])
-
-    @staticmethod
-    def backward(ctx, grad):
-        rows, (B, S, k, D) = ctx.saved_tensors[0], grad.shape
-        grad_u = grad.new_zeros(B * ctx.n, D).scatter_add_(0, rows.expand(-1, D), grad.reshape(-1, D))
-        return grad_u.view(B, ctx.n, D), grad.sum(2), None
+def gather_add(u, v, idx):
+    """u (B,n,D), v (B,S,D), idx (B,S,k) -> u[b, idx] + v[:, :, None] (B,S,k,D). By `gather`, whose way back is quicker on a CPU
+    than that of indexing."""
+    (B, n, D), k = u.shape, idx.shape[2]
+    rows = (idx + n * torch.arange(B, device=idx.device)[:, None, None]).view(-1, 1)           # (B*S*k,1)
+    return u.reshape(B * n, D).gather(0, rows.expand(-1, D)).view(B, -1, k, D).add_(v[:, :, None])
 
 
 class LinearMax(torch.autograd.Function):
@@ -431,7 +403,7 @@ class LinearMax(torch.autograd.Function):
         for b, rows in enumerate(h.reshape(B, S * k, D)):
             torch.mm(rows, W.t(), out=z)
             torch.eq(is_max, out[b][:, None], out=is_max)
-            is_max.mul_((grad[b] / is_max.sum(1).clamp_(min=1))[:, None])
+            is_max.mul_((grad[b] / is_max.sum(1).clamp_(min=1))[:, None])                 # 0 only of NaN
             grad_W.addmm_(z.t(), rows)
             torch.addmm(constant, rows, slope, out=grad_h[b].view(S * k, D)).addmm_(z, W)
         return grad_h, grad_W, None
@@ -503,7 +475,7 @@ class SetAbstraction(nn.Module):
         W_x, W_f = self.h.linears[0].weight.split([3, feat.shape[2]], dim=1)
         u = xyz @ W_x.t() + feat @ W_f.t()                                                     # (B,n,D1)
         v = self.h.linears[0].bias - xyz[:, :idx.shape[1]] @ W_x.t()                           # (B,S,D1)
-        return self.h.rest(GatherAdd.apply(u, v, idx))
+        return self.h.rest(gather_add(u, v, idx))
 
 
 class FlowEmbedding(nn.Module):
@@ -519,7 +491,7 @@ class FlowEmbedding(nn.Module):
         W_x, W_f, W_g = self.h.linears[0].weight.split([3, feat_p.shape[2], feat_q.shape[2]], dim=1)
         u = xyz_q @ W_x.t() + feat_q @ W_g.t()                                                 # (B,n,D1)
         v = self.h.linears[0].bias + feat_p @ W_f.t() - xyz_p @ W_x.t()                        # (B,S,D1)
-        return self.h.rest(GatherAdd.apply(u, v, idx))
+        return self.h.rest(gather_add(u, v, idx))
 
 
 class D3DLO(nn.Module):
@@ -538,11 +510,13 @@ class D3DLO(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(config.mpn.mlp[-1], hidden), nn.BatchNorm1d(hidden), nn.ReLU(), nn.Linear(hidden, out))
 
     def forward(self, batch):
-        """Batch -> (B,6): [tx, ty, tz] m and [roll, pitch, yaw] degrees of T_pq, extrinsic x-y-z (section 3.2). With Config's
+        """Batch -> (B,6): [tx, ty, tz] m and [roll, pitch, yaw] degrees of T_pq (section 3.2), extrinsic x-y-z (ours). With Config's
         quaternion (B,7), see `from_output`."""
         p, q, (n2, n3) = batch.p, batch.q, (batch.idx2.shape[1], batch.idx3.shape[1])
-        feat = [sa.h(group) for sa, group in zip((self.sa1, *self.scales), batch.group)]       # eq. 3, its neighbours come gathered
-        feat = torch.cat(feat, 2) if self.scales else feat[0]                                  # (C,1024,32)
+        feat = self.sa1.h(batch.group[:, :, :self.config.sa1.n_n])                             # (C,1024,32), eq. 3; the neighbours come gathered
+        if self.scales:
+            rest = batch.group[:, :, self.config.sa1.n_n:].split([scale.n_n for scale in self.config.scales], 2)
+            feat = torch.cat([feat, *(sa.h(group) for sa, group in zip(self.scales, rest))], 2)
         feat_p, feat_q = feat.index_select(0, p), feat.index_select(0, q)                      # feat[p] is slow on the way back
         xyz = batch.xyz[p]                                                                     # (B,1024,3)
         flow = self.fe(xyz, feat_p, batch.xyz[q], feat_q, batch.idx_fe)                        # (B,1024,64)
@@ -600,20 +574,20 @@ def load_weights(path=None, device="cpu"):
     try:
         if zipfile.ZipFile(path).testzip():             # torch does not look at the checksums
             raise ValueError("damaged")
-        state = torch.load(path, map_location=device, weights_only=True)
-        net = D3DLO(Config(**state["config"])).to(device)
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        net = D3DLO(Config(**state["config"]))
         net.load_state_dict(state["model"])
-        state["step"], state["train"], from_vector(state["mean_motion"]), unlike(np.zeros(len(LOOKS)), state["seen"])      # KeyError, ValueError
+        state["step"], state["train"].values(), np.reshape(state["mean_motion"], 6), np.reshape(state["seen"], (2, len(LOOKS)))   # there, or it raises
     except Exception as error:      # torch and pickle raise many kinds; to the user they are one
         reason = f"{type(error).__name__}: {error}".splitlines()[-1].strip()
         raise ValueError(f"{path}: no weights of D3DLO ({reason:.120}); give a weights.pt or a run folder") from None
-    return net.eval(), state
+    return net.to(device).eval(), state
 
 
 def moved(clouds, T):
     """(C,) records and T (C,4,4), rigid motions or mirrors -> the records of the clouds T x. No sampling and no ball changes."""
     out, T = clouds.copy(), T.astype(np.float32)
-    for name in ("xyz", *groups(clouds)):
+    for name in ("xyz", "group"):
         xyz = clouds[name][..., :3]
         out[name][..., :3] = (xyz.reshape(len(T), -1, 3) @ T[:, :3, :3].transpose(0, 2, 1)).reshape(xyz.shape)
     out["xyz"] += T[:, None, :3, 3]
@@ -637,10 +611,10 @@ def both_ways(net, clouds, device):
 
 @torch.inference_mode()
 def predict_motions(net, records, device="cpu", batch=16, refine=0):
-    """(n,) records of consecutive scans -> (n-1,4,4) T_{t,t+1}, Velodyne frame, one forward pass a pair, SA1 once a scan.
+    """(n,) records of consecutive scans -> (n-1,4,4) T_{t,t+1}, Velodyne frame, one forward pass a pair.
 
-    Not in the paper: with `refine` the network answers for both directions, and as many times again for what is left of the motion
-    once Q has been moved by the answer so far."""
+    Not in the paper: with `refine` = N each pair is answered in both directions and averaged; then, N times, Q is moved by the answer so
+    far and the network is asked for what is left."""
     out = []
     for i in range(0, len(records) - 1, batch):
         clouds = records[i:i + batch + 1]
@@ -696,7 +670,7 @@ def augment(clouds, T_pq, rng):
     when `predict_motions` refines. (2n,) records, the Ps and then the Qs, (n,4,4) -> the same, changed."""
     n = len(T_pq)
     M = np.where(rng.random((n, 1, 1)) < 0.5, np.diag([1.0, -1, 1, 1]), np.eye(4))
-    A = from_vector(rng.normal(size=(n, 6)) * [0.25, 0.1, 0.03, 0.1, 0.1, 1.0])   # sigmas in m, degrees; most yaw, which driving has least of
+    A = from_vector(rng.normal(size=(n, 6)) * [0.25, 0.1, 0.03, 0.1, 0.1, 1.0])   # sigmas in m, degrees; most yaw: turns are rare, and learned last
     T_pq = M @ T_pq @ M
     A = A @ np.where(rng.random((n, 1, 1)) < 0.25, T_pq, np.eye(4))
     return moved(clouds, np.concatenate([M, A @ M])), T_pq @ invert(A)
@@ -811,17 +785,16 @@ def interruption_waits():
 
 
 def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=print, **remember):
-    """Train `net` by its config: Adam, eq. 2. Returns a net for use, with BatchNorm's statistics recomputed.
+    """Train `net` as its config says (section 4). Returns a net for use, with BatchNorm's statistics recomputed.
 
     Every STORE_EVERY seconds and at the end writes RUN/checkpoint.pt, whose content `resume` goes on from, and RUN/weights.pt, the net for use,
     with `remember` in both. When interrupted finishes its step, writes the checkpoint and raises KeyboardInterrupt."""
     config, per_epoch, run = net.config, steps_per_epoch(motions, net.config), Path(run)
     total = config.epochs * per_epoch
     objective = Objective(config).to(device)
-    minimizers = optimizers(net, objective)
-    schedulers = [schedule(optimizer, config, total) for optimizer in minimizers]
-    parts = {"model": net, "objective": objective, **{f"optimizer{i}": part for i, part in enumerate(minimizers)},
-             **{f"scheduler{i}": part for i, part in enumerate(schedulers)}}
+    parts = {"model": net, "objective": objective}
+    for i, optimizer in enumerate(optimizers(net, objective)):
+        parts |= {f"optimizer{i}": optimizer, f"scheduler{i}": schedule(optimizer, config, total)}
     step, losses = 0, []
     if resume:
         step, losses = resume["step"], resume["losses"]
@@ -852,8 +825,8 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
             net.zero_grad()
             objective.zero_grad()
             loss.backward()
-            rate = schedulers[0].get_last_lr()[0]
-            for part in (*minimizers, *schedulers):
+            rate = parts["scheduler0"].get_last_lr()[0]
+            for part in list(parts.values())[2:]:
                 part.step()
             step += 1
             losses.append(loss.item())
@@ -861,13 +834,14 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
                 say(f"epoch {step // per_epoch}/{config.epochs}: loss {np.mean(losses):.4f}, learning rate {rate:.1e}")
                 losses = []
             if came:
-                store_checkpoint()
-                raise KeyboardInterrupt(f"step {step} is stored; python d3dlo.py train --out {run} --resume goes on from it")
+                break
             if time.monotonic() - stored > STORE_EVERY:
                 store_checkpoint()
                 store_weights()
                 stored = time.monotonic()
         store_checkpoint()
+        if came:
+            raise KeyboardInterrupt(f"step {step} is stored; python d3dlo.py train --out {run} --resume goes on from it")
     loss_train = store_weights()
     loss_eval = mean_loss(usable.eval(), fixed_batches(), objective)
     say(f"loss over {enough} batches, weights fixed: {loss_train:.4f} in train mode, {loss_eval:.4f} in eval mode")
@@ -876,9 +850,9 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
 
 # ----------------------------------------------------------------------------------------------- sections 5 and 6: evaluation
 
-def evaluate_network(net, state, sequences, geometry, out, source, device="cpu", refine=0, plot=False):
+def evaluate_network(net, state, sequences, geometry, out, source, device="cpu", refine=0):
     """Run the network over sequences, write OUT/NN.txt (KITTI pose files) and OUT/results.json (with `source`), return the table.
-    `refine`: see `predict_motions`; `plot`: draw OUT/plot.png, see `metrics.draw`.
+    `refine`: see `predict_motions`.
 
     Beside the network stand two trivial predictors: standing still, and the mean motion of the training set. Rows whose data
     the weights were trained on are marked, by the data's fingerprint and not by name.
@@ -886,7 +860,6 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu",
     out = Path(out)
     constant = {"standing still": np.eye(4), "mean motion of training": from_vector(state["mean_motion"])}
     scores = {predictor: {} for predictor in ("network", *constant)}      # predictor -> sequence -> segment and step errors
-    trajectories = {}                                                      # sequence -> true and estimated poses, camera frame
     for s, records in progress(zip(sequences, geometry), len(sequences), "registering, sequences"):
         strange = [words for words in (unlike(looks, state["seen"]) for looks in records["looks"]) if words]
         if strange:
@@ -899,18 +872,17 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu",
             poses_cam = kitti.velo_to_camera(poses, s.Tr)
             if predictor == "network":
                 metrics.write_poses(out / f"{s.name}.txt", poses_cam)
-                trajectories[s.name] = s.poses_cam, poses_cam
             if s.poses is not None:
                 scores[predictor][s.name] = metrics.segment_errors(s.poses_cam, poses_cam), metrics.step_errors(s.poses, poses)
-    known = {s.name: fingerprint(s) in state["train"].values() for s in sequences}
+    trained_on = {s.name: fingerprint(s) in state["train"].values() for s in sequences}
 
     def summary(names, predictor="network"):
         pooled = [scores[predictor][name] for name in names if name in scores[predictor]]
-        return metrics.summary([e for e, _ in pooled], [e for _, e in pooled]) | {"trained_on": any(known[n] for n in names)}
+        return metrics.summary([e for e, _ in pooled], [e for _, e in pooled]) | {"trained_on": any(trained_on[n] for n in names)}
 
-    splits = {split: [n for n in names if n in known] for split, names in SPLITS.items()}
-    parts = {split: names for split, names in splits.items() if names} | {"all": list(known)}
-    each = {name: summary([name]) for name in known}
+    splits = {split: [n for n in names if n in trained_on] for split, names in SPLITS.items()}
+    parts = {split: names for split, names in splits.items() if names} | {"all": list(trained_on)}
+    each = {name: summary([name]) for name in trained_on}
     pooled = {group: {p: summary(names, p) for p in scores} for group, names in parts.items()}
     lengths = metrics.by_length([segments for segments, _ in scores["network"].values()])
     results = {**source, "sequences": each, "lengths": lengths, "splits": {g: p["network"] for g, p in pooled.items() if g != "all"},
@@ -919,14 +891,11 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu",
     with metrics.replacing(out / "results.json") as temporary:
         temporary.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
     written = f"trajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)\nfigures       {out}/results.json"
-    if plot:
-        metrics.draw(out / "plot.png", trajectories)
-        written += f"\npicture       {out}/plot.png (from above in the camera's frame, errors by length)"
-    server = [f"{i}.txt" for i in range(11, 22)]                # KITTI's sequences without ground truth
-    if {Path(name).stem for name in server} <= set(known):
+    server = [str(i) for i in range(11, 22)]                    # KITTI's sequences without ground truth
+    if set(server) <= trained_on.keys():
         with metrics.replacing(out / "kitti-server.zip") as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
             for name in server:                                 # in its root, as the devkit's readme wants them
-                archive.write(out / name, name)
+                archive.write(out / f"{name}.txt", f"{name}.txt")
         written += f"\nto submit     {out}/kitti-server.zip"
     rows = [metrics.row(name + " *" * s["trained_on"], s) for name, s in each.items()]
     for group, predictions in pooled.items():
@@ -953,7 +922,7 @@ def train(data=None, sequences=None, out=None, epochs=None, batch=None, neighbor
                          sa1=config.sa1._replace(n_n=neighbors or config.sa1.n_n))
     if resume:
         config, data, sequences, seed = begun_with(run)
-    data = data and str(data)
+    data = data and str(Path(data).resolve())
     root = Path(data) if data else kitti.simulate(SIMULATED)
     there = [s.name for s in kitti.open_sequences(root)]
     chosen = kitti.open_sequences(root, sequences or ("train" if set(SPLITS["train"]) & set(there) else "all"))
@@ -1000,13 +969,17 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     check_device(device)
     net, state = load_weights(weights, device)
     out = Path(out or time.strftime("results/%Y-%m-%d-%H%M%S"))
-    root = Path(data) if data else kitti.simulate(SIMULATED, sequences=SPLITS["test"] + SPLITS["validation"])
-    chosen = kitti.open_sequences(root, sequences or ("all" if data else ("test", "validation")))
+    sequences = sequences or ("all" if data else ("test", "validation"))
+    root = Path(data) if data else kitti.simulate(SIMULATED, sequences=sequences)
+    chosen = kitti.open_sequences(root, sequences)
     for s in chosen:
         if s.poses is None and (s.folder / "poses.txt").exists():
             print(f"{s.folder}/poses.txt: SemanticKITTI's, estimated by SuMa; not used, it is no ground truth", file=sys.stderr)
     source = {"weights": str(weights or WEIGHTS), "data": str(root), "refine": refine}
-    print(evaluate_network(net, state, chosen, load_geometry(chosen, net.config), out, source, device, refine, plot))
+    print(evaluate_network(net, state, chosen, load_geometry(chosen, net.config), out, source, device, refine))
+    if plot:
+        metrics.draw(out / "plot.png", {s.name: (s.poses_cam, metrics.read_poses(out / f"{s.name}.txt")) for s in chosen})
+        print(f"picture       {out}/plot.png (from above in the camera's frame, errors by length)")
     return out
 
 
@@ -1048,11 +1021,16 @@ def begun_with(run):
         raise ValueError(f"{run}/config.json: missing or damaged, so there is no training to go on with; give its folder by --out") from None
 
 
-def positive(text, least=1):
-    """A whole number for argparse."""
+def number(text, least=0):
+    """For argparse."""
     if int(text) < least:
         raise argparse.ArgumentTypeError(f"must be {least} or more")
     return int(text)
+
+
+def positive(text):
+    """For argparse."""
+    return number(text, 1)
 
 
 def main(argv=None):
@@ -1078,12 +1056,12 @@ def main(argv=None):
                    help=f"pairs in a batch, each both ways (default: {Config.batch}, short {SHORT['batch']})")
     t.add_argument("--neighbors", type=positive, metavar="N", help=f"n_n of the first set abstraction, Table 2 (default: {Config.sa1.n_n})")
     t.add_argument("--no-plane", action="store_false", dest="plane", help="leave out the points of the ground plane, Table 2")
-    t.add_argument("--seed", type=lambda text: positive(text, 0), default=0, metavar="N",
+    t.add_argument("--seed", type=number, default=0, metavar="N",
                    help="of the first weights, the order of pairs and the augmentation (default: 0)")
     t.add_argument("--short", action="store_true", help="fewer epochs, one-cycle learning rate, augmentation (always without --data)")
     t.add_argument("--resume", action="store_true", help="go on with the training in --out, with the options it was begun with")
     e.add_argument("--weights", metavar="FILE|RUN", help="weights, or folder of a run (default: those shipped)")
-    e.add_argument("--refine", type=lambda text: positive(text, 0), default=0, metavar="N", help=(
+    e.add_argument("--refine", type=number, default=0, metavar="N", help=(
         "not in the paper: average both directions, and apply the network N more times to what is left (default: 0, the plain answer)"))
     e.add_argument("--plot", action="store_true", help="draw the paths and the errors by length; needs matplotlib")
     e.add_argument("--out", metavar="DIR", help="folder for NN.txt and results.json (default: results/TIME)")
@@ -1098,7 +1076,7 @@ def main(argv=None):
                 raise ValueError("--resume goes on with the options the run was begun with; give only --out RUN, and --device")
             train(**args)
     except KeyboardInterrupt as interruption:
-        print(f"\nd3dlo: interrupted; {interruption or 'a training that has begun goes on by train --out RUN --resume'}", file=sys.stderr)
+        print(f"\nd3dlo: interrupted; {str(interruption) or 'run it again; a training goes on by train --out RUN --resume'}", file=sys.stderr)
         return 130
     except (ValueError, OSError, BrokenExecutor) as error:
         print(f"d3dlo: {error}", file=sys.stderr)

@@ -296,7 +296,8 @@ def plain(net, b):
         return x[torch.arange(len(x))[:, None, None], idx]
 
     # SA1, shared: one BatchNorm over the clouds of both sides
-    feat = torch.cat([h(sa.h, group).amax(2) for sa, group in zip((net.sa1, *net.scales), b.group, strict=True)], -1)
+    groups = b.group.split([layer.n_n for layer in (net.config.sa1, *net.config.scales)], 2)
+    feat = torch.cat([h(sa.h, group).amax(2) for sa, group in zip((net.sa1, *net.scales), groups, strict=True)], -1)
     x, f, y, g = b.xyz[b.p], feat[b.p], b.xyz[b.q], feat[b.q]
     y_j, g_j = take(y, b.idx_fe), take(g, b.idx_fe)
     f = h(net.fe.h, torch.cat([y_j - x[:, :, None], f[:, :, None].expand_as(g_j), g_j], -1)).amax(2)            # eq. 4
@@ -317,7 +318,7 @@ def test_the_network_is_equations_3_and_4(training, config, seed):
     rng = generator(seed)
     net = a_net(rng, config).double().train(training)
     batch = a_batch(rng, config)[0]
-    batch = batch._replace(xyz=batch.xyz.double(), group=tuple(group.double() for group in batch.group))
+    batch = batch._replace(xyz=batch.xyz.double(), group=batch.group.double())
     expected, statistics = plain(net, batch)
     got, weights = net(batch), torch.from_numpy(rng.normal(size=expected.shape))
     torch.testing.assert_close(got, expected, rtol=1e-9, atol=1e-9)
@@ -335,7 +336,7 @@ def test_gather_add_and_linear_max_have_the_right_gradients():
     torch.manual_seed(0)
     u, v, h, W = (torch.randn(s, dtype=float, requires_grad=True) for s in ((2, 5, 3), (2, 4, 3), (2, 4, 3, 5), (6, 5)))
     idx = torch.randint(5, (2, 4, 7))                   # some points gathered often
-    assert torch.autograd.gradcheck(lambda u, v: d3dlo.GatherAdd.apply(u, v, idx), (u, v))
+    assert torch.autograd.gradcheck(lambda u, v: d3dlo.gather_add(u, v, idx), (u, v))
     assert torch.autograd.gradcheck(d3dlo.LinearMax.apply, (h, W, True))
 
 
@@ -374,7 +375,7 @@ def test_recomputed_statistics_close_the_gap_between_train_and_eval():
     assert abs(loss_eval - loss_train) < 0.02 * loss_train and abs(loss_eval - loss_train) < 0.2 * abs(before - loss_train)
     assert {m.momentum for m in net.modules() if hasattr(m, "running_mean")} == {0.1}       # as it was
     first, norm = net.sa1.h.linears[0], net.sa1.h.norms[0]      # written out: the plain mean over batches of means, of unbiased variances
-    z = [F.linear(b.group[0], first.weight, first.bias).flatten(0, -2) for b, _ in batches]
+    z = [F.linear(b.group, first.weight, first.bias).flatten(0, -2) for b, _ in batches]
     torch.testing.assert_close(norm.running_mean, torch.stack([a.mean(0) for a in z]).mean(0), rtol=1e-3, atol=1e-4)
     torch.testing.assert_close(norm.running_var, torch.stack([a.var(0) for a in z]).mean(0), rtol=1e-3, atol=1e-4)
 
@@ -428,7 +429,7 @@ def test_sixteen_pairs_can_be_learned_by_heart(tmp_path):
 
 
 def same_batch(a, b):
-    return all(torch.equal(x, y) for x, y in zip(*((*c.group, *c._replace(group=target)) for c, target in (a, b)), strict=True))
+    return all(torch.equal(x, y) for x, y in zip(*((*c, target) for c, target in (a, b)), strict=True))
 
 
 @given(SEED, st.sampled_from(["both", "random"]), st.booleans(), st.integers(1, 9))
@@ -469,8 +470,7 @@ def test_augmented_pairs_still_fit_their_motion(seed):
     clouds, T_new = d3dlo.augment(before, T, rng)
     for p, q, old, X, Y in zip(clouds[:6], clouds[6:], before[:6], T_new, T):
         assert_allclose(move(X, q["xyz"]), p["xyz"], atol=1e-4)
-        for group in ("group", "group2", "group3"):
-            assert_allclose(move(X, q["xyz"][:, None] + q[group][..., :3]), p["xyz"][:, None] + p[group][..., :3], atol=1e-4)
+        assert_allclose(move(X, q["xyz"][:, None] + q["group"][..., :3]), p["xyz"][:, None] + p["group"][..., :3], atol=1e-4)
         assert np.linalg.det(X[:3, :3]) > 0.999 and np.abs(X - Y).max() > 1e-3      # no reflection is left, and something moved
         assert_array_equal(np.abs(p["xyz"]), np.abs(old["xyz"]))                    # P is at most mirrored
     for field in ("idx2", "idx3"):
@@ -494,9 +494,9 @@ def fit(folder, config, resume=None, stop=None):
     return said
 
 
-@pytest.mark.parametrize("schedule", ["steps", "one-cycle"])
-def test_a_resumed_training_ends_in_the_same_weights(tmp_path, monkeypatch, schedule):
-    config, clock = replace(SMALL, epochs=5, batch=4, schedule=schedule, augment=True), iter(range(0, 10 ** 9, 1000))
+@pytest.mark.parametrize("schedule, optimizer", [("steps", "adam"), ("one-cycle", "adam"), ("one-cycle", "muon")])
+def test_a_resumed_training_ends_in_the_same_weights(tmp_path, monkeypatch, schedule, optimizer):
+    config, clock = replace(SMALL, epochs=5, batch=4, schedule=schedule, optimizer=optimizer, augment=True), iter(range(0, 10 ** 9, 1000))
     monkeypatch.setattr(d3dlo, "time", types.SimpleNamespace(monotonic=lambda: next(clock)))    # in a hurry: a checkpoint after each step
     whole, part = fit(tmp_path / "whole", config), fit(tmp_path / "part", config, stop="epoch 3/")
     state = torch.load(tmp_path / "part" / "checkpoint.pt", weights_only=True)
@@ -915,11 +915,11 @@ def test_degenerate_scenes_end_in_a_finite_motion_or_a_refusal(tmp_path, scene):
             odometry = d3dlo.Odometry(tmp_path / "w.pt", refine=refine)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)
-                odometry.register(p)
                 if scene is SCENES["absurd intensities"]:
-                    with pytest.raises(ValueError, match="intensities"):
+                    with pytest.raises(ValueError, match="intensity"):
                         odometry.register(q)
                     continue
+                odometry.register(p)
                 pose = odometry.register(q)
             assert np.isfinite(pose).all()
             assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)

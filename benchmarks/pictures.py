@@ -2,10 +2,12 @@
 
     python benchmarks/pictures.py method docs/method.png            # what the network sees of two simulated scans
     python benchmarks/pictures.py method docs/method.png --data ROOT --sequence 00 --scan 100
+    python benchmarks/pictures.py curve runs/A/curve.png runs/A runs/B ...      # loss by epoch
     python benchmarks/pictures.py budget docs/budget.png runs/A runs/B ...      # errors of finished trainings by their pair-steps
 """
 import argparse
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -61,6 +63,19 @@ def method(root, name, i):
     return figure
 
 
+def curve(runs):
+    """The loss of each epoch, from the trainings' logs."""
+    figure = Figure(figsize=(6, 3.5), layout="constrained")
+    axis = figure.subplots()
+    for run, style in zip(runs, ("k-", "k--", "k:", "k-.") * len(runs)):
+        losses = re.findall(r"^epoch (\d+)/\d+: loss ([\d.]+)", (run / "log.txt").read_text(encoding="utf-8"), re.M)
+        axis.plot(*np.array(losses, float).reshape(-1, 2).T, style, label=run.name)
+    axis.set(xlabel="epoch", ylabel="mean loss, eq. 2: m and degrees alike", yscale="log")
+    axis.legend(frameon=False)
+    axis.grid(color="0.9", which="both")
+    return figure
+
+
 def budget(runs):
     """Errors of the trainings in `runs`, as their own evaluation found them, by pair-steps."""
     points = []
@@ -81,18 +96,20 @@ def main():
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
-    m, b = commands.add_parser("method"), commands.add_parser("budget")
+    m = commands.add_parser("method")
     m.add_argument("picture", type=Path)
     m.add_argument("--data", metavar="ROOT", help="folder in KITTI odometry layout (default: the simulated city)")
     m.add_argument("--sequence", default="03", metavar="NN")
     m.add_argument("--scan", type=int, default=60, metavar="N")
-    b.add_argument("picture", type=Path)
-    b.add_argument("runs", nargs="+", type=Path, metavar="RUN")
+    for name in ("curve", "budget"):
+        p = commands.add_parser(name)
+        p.add_argument("picture", type=Path)
+        p.add_argument("runs", nargs="+", type=Path, metavar="RUN")
     args = parser.parse_args()
     if args.command == "method":
         figure = method(args.data or kitti.simulate(d3dlo.SIMULATED, sequences=[args.sequence]), args.sequence, args.scan)
     else:
-        figure = budget(args.runs)
+        figure = {"curve": curve, "budget": budget}[args.command](args.runs)
     with metrics.replacing(args.picture) as temporary:
         figure.savefig(temporary, format="png", dpi=100)
     print(args.picture)
