@@ -365,12 +365,23 @@ def make_batch(clouds, p, q, config, device="cpu"):
 
 # --------------------------------------------------------------------------------------------- section 3.3: the network (torch)
 
-def gather_add(u, v, idx):
-    """u (B,n,D), v (B,S,D), idx (B,S,k) -> u[b, idx] + v[:, :, None] (B,S,k,D). By `gather`, whose way back is quicker on a CPU
-    than that of indexing."""
-    (B, n, D), k = u.shape, idx.shape[2]
-    rows = (idx + n * torch.arange(B, device=idx.device)[:, None, None]).view(-1, 1)           # (B*S*k,1)
-    return u.reshape(B * n, D).gather(0, rows.expand(-1, D)).view(B, -1, k, D).add_(v[:, :, None])
+class GatherAdd(torch.autograd.Function):
+    """u (B,n,D), v (B,S,D), idx (B,S,k) -> u[b, idx] + v[:, :, None] (B,S,k,D), with its way back written out: on a CPU it takes half
+    as long as torch's own of gather, and less than that of indexing."""
+
+    @staticmethod
+    def forward(ctx, u, v, idx):
+        (B, n, D), k = u.shape, idx.shape[2]
+        rows = (idx + n * torch.arange(B, device=idx.device)[:, None, None]).view(-1, 1)       # (B*S*k,1)
+        ctx.save_for_backward(rows)
+        ctx.n = n
+        return u.reshape(B * n, D).gather(0, rows.expand(-1, D)).view(B, -1, k, D).add_(v[:, :, None])
+
+    @staticmethod
+    def backward(ctx, grad):
+        rows, (B, S, k, D) = ctx.saved_tensors[0], grad.shape
+        grad_u = grad.new_zeros(B * ctx.n, D).scatter_add_(0, rows.expand(-1, D), grad.reshape(-1, D))
+        return grad_u.view(B, ctx.n, D), grad.sum(2), None
 
 
 class LinearMax(torch.autograd.Function):
@@ -475,7 +486,7 @@ class SetAbstraction(nn.Module):
         W_x, W_f = self.h.linears[0].weight.split([3, feat.shape[2]], dim=1)
         u = xyz @ W_x.t() + feat @ W_f.t()                                                     # (B,n,D1)
         v = self.h.linears[0].bias - xyz[:, :idx.shape[1]] @ W_x.t()                           # (B,S,D1)
-        return self.h.rest(gather_add(u, v, idx))
+        return self.h.rest(GatherAdd.apply(u, v, idx))
 
 
 class FlowEmbedding(nn.Module):
@@ -491,7 +502,7 @@ class FlowEmbedding(nn.Module):
         W_x, W_f, W_g = self.h.linears[0].weight.split([3, feat_p.shape[2], feat_q.shape[2]], dim=1)
         u = xyz_q @ W_x.t() + feat_q @ W_g.t()                                                 # (B,n,D1)
         v = self.h.linears[0].bias + feat_p @ W_f.t() - xyz_p @ W_x.t()                        # (B,S,D1)
-        return self.h.rest(gather_add(u, v, idx))
+        return self.h.rest(GatherAdd.apply(u, v, idx))
 
 
 class D3DLO(nn.Module):

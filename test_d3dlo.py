@@ -336,7 +336,7 @@ def test_gather_add_and_linear_max_have_the_right_gradients():
     torch.manual_seed(0)
     u, v, h, W = (torch.randn(s, dtype=float, requires_grad=True) for s in ((2, 5, 3), (2, 4, 3), (2, 4, 3, 5), (6, 5)))
     idx = torch.randint(5, (2, 4, 7))                   # some points gathered often
-    assert torch.autograd.gradcheck(lambda u, v: d3dlo.gather_add(u, v, idx), (u, v))
+    assert torch.autograd.gradcheck(lambda u, v: d3dlo.GatherAdd.apply(u, v, idx), (u, v))
     assert torch.autograd.gradcheck(d3dlo.LinearMax.apply, (h, W, True))
 
 
