@@ -588,7 +588,8 @@ def load_weights(path=None, device="cpu"):
         state = torch.load(path, map_location="cpu", weights_only=True)
         net = D3DLO(Config(**state["config"]))
         net.load_state_dict(state["model"])
-        state["step"], state["train"].values(), np.reshape(state["mean_motion"], 6), np.reshape(state["seen"], (2, len(LOOKS)))   # there, or it raises
+        state["step"], state["train"].values()          # all must be there
+        np.reshape(state["mean_motion"], 6), np.reshape(state["seen"], (2, len(LOOKS)))
     except Exception as error:      # torch and pickle raise many kinds; to the user they are one
         reason = f"{type(error).__name__}: {error}".splitlines()[-1].strip()
         raise ValueError(f"{path}: no weights of D3DLO ({reason:.120}); give a weights.pt or a run folder") from None
@@ -954,8 +955,9 @@ def train(data=None, sequences=None, out=None, epochs=None, batch=None, neighbor
     arguments = dict(data=data, sequences=names, seed=seed, device=device)
     versions = {"d3dlo": revision(), "python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__,
                 "torch": torch.__version__}
+    begun = dict(arguments=arguments, config=config.as_dict(), versions=versions, fingerprints=remember["train"])
     with metrics.replacing(run / "config.json") as temporary:
-        temporary.write_text(json.dumps(dict(arguments=arguments, config=config.as_dict(), versions=versions, fingerprints=remember["train"]), indent=1) + "\n")
+        temporary.write_text(json.dumps(begun, indent=1) + "\n")
 
     def say(line):
         print(line, flush=True)

@@ -64,18 +64,6 @@ def read_calib(path):
     return Tr
 
 
-def read_times(path):
-    """times.txt -> (n,) float64, seconds since the first scan. Raises FileNotFoundError, or ValueError when it holds anything but numbers."""
-    words = _read(path, "it comes with the odometry calibration archive (data_odometry_calib.zip)").split()
-    try:
-        times = np.array(words, dtype=float)
-    except ValueError:
-        times = np.array([np.nan])
-    if not np.isfinite(times).all():
-        raise ValueError(f"{path} must hold one number (seconds) a line: unpack the odometry calibration archive again.")
-    return times
-
-
 # --------------------------------------------------------------------------------------------------------------- frames
 
 def invert(T):
@@ -130,7 +118,7 @@ class Sequence:
     times.txt} and, where there is ground truth, ROOT/poses/NAME.txt.
 
     name, scan_paths (list of n paths), Tr (4,4) = T_cam0_velo, poses_cam (n,4,4) as in the file or None, poses (n,4,4) = T_0t in the
-    Velodyne frame or None, times (n,) s. Raises FileNotFoundError or ValueError when anything is missing or does not fit together."""
+    Velodyne frame or None. Raises FileNotFoundError or ValueError when anything is missing or does not fit together."""
 
     def __init__(self, root, name):
         _check_name(name)
@@ -161,14 +149,6 @@ class Sequence:
 
     def __len__(self):
         return len(self.scan_paths)
-
-    @functools.cached_property
-    def times(self):
-        """(n,) seconds; ValueError when times.txt has another number of rows than there are scans."""
-        times = read_times(self.folder / "times.txt")
-        if len(times) != len(self):
-            raise ValueError(f"{self.folder / 'times.txt'} has {len(times)} times for {len(self)} scans: unpack the calibration archive again.")
-        return times
 
     def scan(self, i):
         """Scan i as (N,4) float32, see `read_scan`."""

@@ -705,7 +705,7 @@ def test_the_simulation_gives_the_same_bytes_however_it_is_made(city, tmp_path):
 
 def test_the_simulation_is_in_kittis_layout(city):
     for s in kitti.open_sequences(city):
-        assert len(s) == len(s.poses) == len(s.times) == 8
+        assert len(s) == len(s.poses) == 8
         assert_allclose(s.poses[0], np.eye(4), atol=1e-8)
         assert np.abs(s.Tr[:3, :3] - np.eye(3)).max() > 0.9 and np.abs(s.Tr[:3, 3]).max() > 0.1     # a mistake of frames would show
         for scan in map(s.scan, range(8)):
@@ -816,16 +816,6 @@ def test_a_bad_scan_leaves_nothing_in_the_cache_and_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"000005\.bin.*20 usable"):
         load_geometry(kitti.open_sequences(root), SMALL, cache)
     assert list(cache.iterdir()) == []
-
-
-def test_times_must_be_numbers(tmp_path):
-    for text, n in (("0 0.1\n0.2\n", 3), ("", 0), ("0\nnan\n", None), ("inf", None), ("zero", None)):
-        (tmp_path / "times.txt").write_text(text)
-        if n is None:
-            with pytest.raises(ValueError, match="times.txt"):
-                kitti.read_times(tmp_path / "times.txt")
-        else:
-            assert len(kitti.read_times(tmp_path / "times.txt")) == n
 
 
 # --------------------------------------------------------------------------------------------------- weights and odometry

@@ -101,7 +101,6 @@ def readers(folder, rng):
     np.save(folder / "cache.npy", records)
     (folder / "config.json").write_text(json.dumps(dict(arguments=dict(data=None, sequences=["00"], seed=0), config=SMALL.as_dict())))
     (folder / "calib.txt").write_text(kitti._calibration()[1])
-    (folder / "times.txt").write_text("".join(f"{0.1 * i:e}\n" for i in range(9)))
     scan.tofile(folder / "000000.bin")
 
     def cached(path):                                   # damage is no error: the cache is made again
@@ -115,7 +114,6 @@ def readers(folder, rng):
         "geometry of a scan": ("000000.bin", lambda path: d3dlo._geometry_of_file(path, SMALL), lambda r: finite(r["xyz"], 32, 3) and finite(r["group"], 32, 4, 4)),
         "poses": ("poses.txt", metrics.read_poses, lambda T: finite(T, None, 4, 4)),
         "calibration": ("calib.txt", kitti.read_calib, lambda T: finite(T, 4, 4)),
-        "times": ("times.txt", kitti.read_times, lambda t: finite(t, None)),
         "weights": ("weights.pt", d3dlo.load_weights, same_weights),
         "cache": ("cache.npy", cached, lambda r: r is None or r.tobytes() == records.tobytes()),
         "settings of a run": ("config.json", lambda path: d3dlo.begun_with(path.parent), lambda begun: isinstance(begun[0], Config)),
