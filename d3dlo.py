@@ -155,7 +155,7 @@ def _side_by_side(xyz):
     return np.argsort(SPACED[a] | SPACED[r] << 1, kind="stable")
 
 
-def farthest_point_sampling(xyz, n, start=0):
+def farthest_point_sampling(xyz: np.ndarray, n: int, start: int = 0) -> np.ndarray:
     """Exact farthest point sampling: (N,3) -> (n,) int64 indices. Each pick is the point farthest from all picks before it.
 
     Ties go to the lowest index (so picks repeat when fewer than n points differ). Nested: the first m picks are what n = m gives.
@@ -191,7 +191,7 @@ def farthest_point_sampling(xyz, n, start=0):
     return picks
 
 
-def group_ball(xyz, centroids, r, n_n, tree=None, spread=1):
+def group_ball(xyz: np.ndarray, centroids: np.ndarray, r: float, n_n: int, tree: cKDTree | None = None, spread: int = 1) -> np.ndarray:
     """The ball of eq. 3: (N,3) points, (S,) indices of the centroids among them -> (S,n_n) indices of points within r metres, r
     included: the nearest n_n, or with spread > 1 n_n in even steps, from first to last, of the nearest spread * n_n.
 
@@ -206,7 +206,7 @@ def group_ball(xyz, centroids, r, n_n, tree=None, spread=1):
     return np.where(rank < size, np.take_along_axis(idx, rank, 1), centroids[:, None])
 
 
-def group_knn(xyz, query, k):
+def group_knn(xyz: np.ndarray, query: np.ndarray, k: int) -> np.ndarray:
     """The neighbours of the flow embedding (section 3.3.3): (N,3) points, (S,3) -> (S,k) indices of the k points nearest to each
     query point; with fewer than k points the nearest is repeated."""
     _, idx = cKDTree(xyz).query(query, [*range(1, k + 1)])
@@ -233,7 +233,7 @@ def geometry_dtype(config):
 GEOMETRY = 3    # raise when scan_geometry changes, so that older caches are not read
 
 
-def scan_geometry(scan, config=Config()):
+def scan_geometry(scan: np.ndarray, config: Config = Config()) -> np.ndarray:
     """Sampling and grouping of all three set abstractions: scan (N,4) -> record of `geometry_dtype`. FPS is nested, so one
     sampling serves them all. Points that are not finite or beyond MAX_RANGE are left out, and of absurd intensity; ValueError when too few remain."""
     with np.errstate(over="ignore"):
@@ -508,7 +508,7 @@ class FlowEmbedding(nn.Module):
 class D3DLO(nn.Module):
     """The network of Fig. 1 and Table 1: SA1 on both clouds, FE between them, SA2, SA3, mini-PointNet, MLP."""
 
-    def __init__(self, config=Config()):
+    def __init__(self, config: Config = Config()):
         super().__init__()
         self.config = config
         self.sa1 = SetAbstraction(1, config.sa1)                                               # c = 1: intensity
@@ -520,7 +520,7 @@ class D3DLO(nn.Module):
         hidden, out = config.mlp.mlp
         self.mlp = nn.Sequential(nn.Linear(config.mpn.mlp[-1], hidden), nn.BatchNorm1d(hidden), nn.ReLU(), nn.Linear(hidden, out))
 
-    def forward(self, batch):
+    def forward(self, batch: Batch) -> torch.Tensor:
         """Batch -> (B,6): [tx, ty, tz] m and [roll, pitch, yaw] degrees of T_pq (section 3.2), extrinsic x-y-z (ours). With Config's
         quaternion (B,7), see `from_output`."""
         p, q, (n2, n3) = batch.p, batch.q, (batch.idx2.shape[1], batch.idx3.shape[1])
@@ -575,7 +575,7 @@ class Objective(nn.Module):
 
 # --------------------------------------------------------------------------------------------------------- odometry, eq. 1
 
-def load_weights(path=None, device="cpu"):
+def load_weights(path: str | Path | None = None, device: str = "cpu") -> tuple[D3DLO, dict]:
     """Weights file or run folder (None: those beside this file) -> (D3DLO in eval mode, the file's dict).
     The network is rebuilt from the file itself. FileNotFoundError, ValueError."""
     path = Path(path or WEIGHTS)
@@ -646,11 +646,11 @@ class Odometry:
     """Poses from scans, one at a time: `Odometry().register(scan)`. `weights`: a file or a run folder, None for those shipped;
     `refine`: see `predict_motions`."""
 
-    def __init__(self, weights=None, device="cpu", refine=0):
+    def __init__(self, weights: str | Path | None = None, device: str = "cpu", refine: int = 0):
         self.net, state = load_weights(weights, device)
         self.seen, self.device, self.refine, self.pose, self.last = state["seen"], device, refine, np.eye(4), None
 
-    def register(self, scan):
+    def register(self, scan: np.ndarray) -> np.ndarray:
         """(N,4) float32 x, y, z [m], intensity 0..1 -> pose (4,4) float64 T_{0,t} of this scan in the first one's Velodyne frame,
         the identity for the first. The motion depends on the last two scans alone. NaN or infinite points are left out with a
         warning; ValueError for a scan that is refused, which changes nothing."""
@@ -666,7 +666,7 @@ class Odometry:
         return self.pose.copy()
 
 
-def relative_pose(scan_p, scan_q, weights=None):
+def relative_pose(scan_p: np.ndarray, scan_q: np.ndarray, weights: str | Path | None = None) -> np.ndarray:
     """Two scans (N,4) -> T_pq (4,4) float64, which maps points of Q into P's frame (section 3.1). As in `Odometry`, which serves
     better for many pairs: the weights are loaded at each call."""
     odometry = Odometry(weights)

@@ -37,7 +37,7 @@ def _check_scan_size(path, size):
                          "it is no whole KITTI scan, copy or unpack it again.")
 
 
-def read_scan(path):
+def read_scan(path: str | Path) -> np.ndarray:
     """One velodyne/*.bin -> (N,4) float32: x, y, z [m] in the Velodyne frame, intensity 0..1, as in the file (NaN included).
     Raises FileNotFoundError, or ValueError when the file is empty or its size is no multiple of 16 bytes."""
     data = _read(path, "give the path of a KITTI scan (velodyne/000000.bin)")
@@ -45,7 +45,7 @@ def read_scan(path):
     return np.frombuffer(data, "<f4").reshape(-1, 4).astype(np.float32)  # (N,4), a copy that may be written to
 
 
-def read_calib(path):
+def read_calib(path: str | Path) -> np.ndarray:
     """calib.txt of a sequence -> T_cam0_velo (4,4) float64, its row `Tr`: Velodyne points to the rectified left camera [m].
     Raises FileNotFoundError; ValueError when `Tr` is missing, is not 12 finite numbers or does not hold a rotation."""
     get = "download the odometry calibration archive (data_odometry_calib.zip)"
@@ -85,7 +85,7 @@ def velo_to_camera(T_velo, Tr):
     return Tr @ T_velo @ invert(Tr)
 
 
-def to_vector(T):
+def to_vector(T: np.ndarray) -> np.ndarray:
     """Rigid transforms (...,4,4) -> (...,6) float64: [tx, ty, tz] m, [roll, pitch, yaw] degrees, extrinsic x-y-z (paper 3.2)."""
     T = np.asarray(T, dtype=float)
     flat = T.reshape(-1, 4, 4)
@@ -95,7 +95,7 @@ def to_vector(T):
     return np.concatenate([flat[:, :3, 3], angles], axis=1).reshape(T.shape[:-2] + (6,))
 
 
-def from_vector(v):
+def from_vector(v: np.ndarray) -> np.ndarray:
     """The inverse of `to_vector`: (...,6) metres and degrees -> (...,4,4) float64."""
     v = np.asarray(v, dtype=float)
     flat = v.reshape(-1, 6)
@@ -150,11 +150,11 @@ class Sequence:
     def __len__(self):
         return len(self.scan_paths)
 
-    def scan(self, i):
+    def scan(self, i: int) -> np.ndarray:
         """Scan i as (N,4) float32, see `read_scan`."""
         return read_scan(self.scan_paths[i])
 
-    def motions(self):
+    def motions(self) -> np.ndarray:
         """(n-1,4,4) T_{t,t+1} = inv(T_t) @ T_{t+1} (paper eq. 1) in the Velodyne frame: maps points of scan t+1 into scan t.
         Raises ValueError when the sequence has no ground truth."""
         if self.poses is None:
@@ -163,7 +163,7 @@ class Sequence:
         return invert(self.poses[:-1]) @ self.poses[1:]
 
 
-def open_sequences(root, names=None):
+def open_sequences(root: str | Path, names: str | list[str] | None = None) -> list[Sequence]:
     """ROOT and names -> list of `Sequence`, in the order given, each once. A name is a folder under ROOT/sequences, a split of SPLITS (as
     much of it as there is) or 'all'; None is 'all'. Raises FileNotFoundError when ROOT is not in KITTI's odometry layout, ValueError for an
     unknown name or a split of which nothing is there, and whatever `Sequence` raises."""
@@ -195,7 +195,7 @@ def open_sequences(root, names=None):
 
 # ------------------------------------------------------------------------------------------------------------ the plane
 
-def remove_plane(scan, threshold=0.15, max_tilt=15.0, hypotheses=400, subsample=4000, seed=0):
+def remove_plane(scan: np.ndarray, threshold=0.15, max_tilt=15.0, hypotheses=400, subsample=4000, seed=0) -> np.ndarray:
     """A scan (N,3+) -> the scan without the points nearer than `threshold` [m] to its dominant near-horizontal plane (RANSAC; paper 4), order kept.
 
     Planes through three random points whose normal is within `max_tilt` degrees of vertical are scored all at once on a random subsample;

@@ -52,7 +52,7 @@ def replacing(path):
         temporary.unlink(missing_ok=True)
 
 
-def read_poses(path):
+def read_poses(path: str | Path) -> np.ndarray:
     """A KITTI pose file, 12 numbers a row (the top three rows of a 4x4), as (n,4,4) float64. ValueError, FileNotFoundError."""
     path = Path(path)
     if not path.is_file():
@@ -105,7 +105,7 @@ def path_lengths(T):
     return np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1))])
 
 
-def segment_errors(T_gt, T_est):
+def segment_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
     """Errors of all KITTI segments of one sequence (paper: eqs. 6 to 8, whose means `kitti_errors` takes; devkit: calcSequenceErrors).
 
     (n,4,4), (n,4,4) -> structured array with fields first, last (frames), length [m], t_err [%], r_err [deg/m].
@@ -129,13 +129,13 @@ def segment_errors(T_gt, T_est):
     return out
 
 
-def kitti_errors(segments):
+def kitti_errors(segments: list[np.ndarray]) -> tuple[float, float]:
     """List of `segment_errors`, one a sequence -> (E_t [%], E_r [deg/m]), the mean over all their segments; NaN without any."""
     pooled = np.concatenate([np.empty(0, SEGMENT), *segments])
     return (float(pooled["t_err"].mean()), float(pooled["r_err"].mean())) if len(pooled) else (float("nan"),) * 2
 
 
-def step_errors(T_gt, T_est):
+def step_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
     """(n,4,4), (n,4,4) -> (n-1,2): length [m] and angle [deg] of inv(T_est) @ T_gt of each step, in the frame of the poses."""
     T_gt, T_est = _same_length(T_gt, T_est)
     motion_gt, motion_est = (np.linalg.inv(T[:-1]) @ T[1:] for T in (T_gt, T_est))
@@ -143,7 +143,7 @@ def step_errors(T_gt, T_est):
     return np.stack([np.linalg.norm(error[:, :3, 3], axis=1), _angle(error[:, :3, :3])], 1)
 
 
-def absolute_errors(T_gt, T_est):
+def absolute_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
     """(n,) distances [m] between true and estimated positions, both starting where the files say: nothing is aligned."""
     T_gt, T_est = _same_length(T_gt, T_est)
     return np.linalg.norm(T_gt[:, :3, 3] - T_est[:, :3, 3], axis=1)
