@@ -80,7 +80,7 @@ def read_poses(path: str | Path) -> np.ndarray:
     return T
 
 
-def write_poses(path, T):
+def write_poses(path: str | Path, T: np.ndarray) -> None:
     """Write (n,4,4) poses as a KITTI pose file, through a temporary file."""
     with replacing(path) as temporary:
         np.savetxt(temporary, np.asarray(T)[:, :3].reshape(-1, 12), fmt="%.9e")
