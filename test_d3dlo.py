@@ -1,6 +1,6 @@
 """Properties of D3DLO. Every expectation comes from an independent source: brute force, SciPy, a definition written out, or a closed
 form. Real data are optional: D3DLO_KITTI names a folder in KITTI odometry layout; without it those tests are skipped."""
-import json, math, os, pickle, re, runpy, shutil, signal, subprocess, sys, types, warnings, zipfile
+import argparse, json, math, os, pickle, re, runpy, shutil, signal, subprocess, sys, types, warnings, zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -1177,3 +1177,24 @@ def test_pictures_are_drawn_where_there_is_matplotlib(tmp_path, monkeypatch):
     assert metrics.main([str(tmp_path / "gt.txt"), str(tmp_path / "est.txt"), "--plot", str(tmp_path / "a.png")]) == 0
     metrics.draw(tmp_path / "b.png", {"11": (None, T)})                             # without ground truth
     assert all((tmp_path / name).read_bytes().startswith(b"\x89PNG") for name in ("a.png", "b.png"))
+
+
+def test_the_readme_s_python_runs_and_its_commands_parse(here, monkeypatch):
+    class Parsed(Exception):
+        pass
+
+    def parse_only(parser, arguments=None, parse=argparse.ArgumentParser.parse_args):
+        parse(parser, arguments)                        # SystemExit when it does not like them
+        raise Parsed
+    text = (HERE / "README.md").read_text(encoding="utf-8")
+    for block in re.findall(r"```python\n(.*?)```", text, re.S):
+        exec(compile(block, "README.md", "exec"), {})
+    commands = re.findall(r"^(?:pip install \S+ && )?python (\S+\.py)([^#\n]*)", text, re.M) + re.findall(r"`python (\S+\.py)([^`]*)`", text)
+    assert len(commands) > 12
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse_only)
+    for script, arguments in commands:
+        monkeypatch.setattr(sys, "argv", [script, *arguments.split()])
+        if "pictures" in script:
+            pytest.importorskip("matplotlib")
+        with pytest.raises(Parsed):
+            runpy.run_path(str(HERE / script), run_name="__main__")
