@@ -12,7 +12,7 @@ Frame: Velodyne, x forward, y left, z up, metres. `T_ab` maps points of frame b 
 a vector [tx, ty, tz] in metres and [roll, pitch, yaw] in degrees. Shapes: N points of a scan, S centroids, k neighbours of each,
 B pairs of scans, C clouds (scans) in a batch, D features.
 
-    python d3dlo.py train                       # simulated city, 12 minutes on two CPU cores
+    python d3dlo.py train                       # simulated city, 10 minutes on two CPU cores
     python d3dlo.py train --data ROOT           # KITTI odometry, the paper's schedule
     python d3dlo.py eval --data ROOT            # with the weights beside this file
 """
@@ -105,7 +105,7 @@ class Config:
         return json.loads(json.dumps(asdict(self)))
 
 
-SHORT = dict(epochs=9, batch=8, optimizer="muon", lr=1e-2, schedule="one-cycle", augment=True)      # the 12-minute training on the simulated city
+SHORT = dict(epochs=9, batch=8, optimizer="muon", lr=1e-2, schedule="one-cycle", augment=True)      # the 10-minute training on the simulated city
 
 
 # ------------------------------------------------------------------------------------ sections 3.1, 3.2: problem and objective
