@@ -28,7 +28,8 @@ import kitti
 
 TRAIN = ["train", "--data", "drives", "--short", "--batch", "4", "--epochs", "20"]
 CHILD = f"""
-import resource, sys
+import resource, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)       # a shell's background job would ignore Ctrl-C
 sys.path.insert(0, {str(HERE)!r})
 import d3dlo, torch
 if __name__ == "__main__":
