@@ -338,25 +338,28 @@ def _looks(rng, n=None):
                      np.where(van, rng.uniform(2, 2.8, n), rng.uniform(1.4, 1.6, n)), 0.02 + 0.5 * rng.random(n) ** 2])
 
 
-def _roadside(rng, at, length, odds):
-    """Everything that stands along a road of `length` m -> (n,10) prisms; what would stand on the road is taken away again."""
-    out, u = [], rng.uniform
-    zones = rng.choice(3, p=np.array(odds) / sum(odds), size=(2, int(length / 70) + 1))  # 0 dense, 1 suburban, 2 open
+class _Street:
+    """What stands on one side of a road of `length` m: `out` collects prisms, `zone(s)` is 0 dense, 1 suburban, 2 open at s metres."""
 
-    def put(s, left, half_x, half_y, z0, z1, albedo, fuzz=0.0, round_=0, twist=0.0):
-        x, y, yaw = at(s, left)
-        out.append(_rows(x, y, yaw + twist, half_x, half_y, z0, z1, albedo, fuzz, round_))
+    def __init__(self, rng, at, length, side, edge, zones):
+        self.rng, self.at, self.length, self.out = rng, at, length, []
+        self.side, self.edge, self.zone = side, edge, lambda s: zones[int(s / 70)]  # side: 1 left, -1 right; edge [m] of the road
 
-    def tree(s, left):
+    def put(self, s, left, half_x, half_y, z0, z1, albedo, fuzz=0.0, round_=0, twist=0.0):
+        x, y, yaw = self.at(s, left)
+        self.out.append(_rows(x, y, yaw + twist, half_x, half_y, z0, z1, albedo, fuzz, round_))
+
+    def tree(self, s, left):
+        u = self.rng.uniform
         radius, crown = u(0.1, 0.3), u(1.8, 3.4)
-        put(s, left, radius, radius, 0, crown + 1, u(0.15, 0.35), round_=1)
-        put(s, left, r := u(1.2, 2.8), r, crown, crown + u(3, 6), u(0.2, 0.45), fuzz=u(0.3, 1.5), round_=1)
+        self.put(s, left, radius, radius, 0, crown + 1, u(0.15, 0.35), round_=1)
+        self.put(s, left, r := u(1.2, 2.8), r, crown, crown + u(3, 6), u(0.2, 0.45), fuzz=u(0.3, 1.5), round_=1)
 
-    for side, edge in ((1, 1.5 * LANE), (-1, 0.5 * LANE)):
-        zone = lambda s: zones[(side + 1) // 2, int(s / 70)]
-        s = 0.0
-        while s < length:  # houses and gardens, one plot after the other
-            kind = zone(s)
+    def plots(self):
+        """Houses and gardens, one plot after the other."""
+        rng, u, put, side, edge, s = self.rng, self.rng.uniform, self.put, self.side, self.edge, 0.0
+        while s < self.length:
+            kind = self.zone(s)
             plot = u(9, 22) if kind == 0 else u(9, 16)
             back = edge + (u(3.5, 7) if kind == 0 else u(6, 14) if kind == 1 else u(8, 30))  # where the facade is
             mid, shade, depth = s + plot / 2, u(0.2, 0.42), u(7, 13)
@@ -368,30 +371,53 @@ def _roadside(rng, at, length, odds):
                 hedge = rng.random() < 0.6
                 put(mid, side * (edge + u(2.2, 3.2)), plot * u(0.3, 0.48), 0.35 if hedge else 0.1, 0, u(0.6, 1.9), u(0.2, 0.4), fuzz=0.25 * hedge)
             for _ in range(rng.poisson((0.3, 1.2, 1.5)[kind])):  # trees and bushes of the garden
-                tree(s + u(0, 1) * plot, side * u(edge + 3, back + 3))
+                self.tree(s + u(0, 1) * plot, side * u(edge + 3, back + 3))
                 put(s + u(0, 1) * plot, side * (edge + u(3, 7)), r := u(0.4, 1.2), r, 0, u(0.5, 1.8), u(0.2, 0.4), fuzz=0.25, round_=1)
             s += plot + (u(5, 14) if kind or rng.random() < 0.35 else u(0, 1))  # a gap, at times a side street
-        s = 0.0
-        while s < length:  # parked cars
+
+    def parked_cars(self):
+        rng, s = self.rng, 0.0
+        while s < self.length:
             looks = _looks(rng)
-            if rng.random() < (0.55, 0.35, 0.06)[zone(s)]:
-                x, y, yaw = at(s, side * (edge + u(1.0, 1.3)))
-                out.append(_cars(x, y, yaw + rng.normal() * 0.03, looks))
-            s += looks[0] + u(0.6, 3)
-        s = 0.0
-        while s < length:  # trees, lamps, signs and boxes on the pavement
+            if rng.random() < (0.55, 0.35, 0.06)[self.zone(s)]:
+                x, y, yaw = self.at(s, self.side * (self.edge + rng.uniform(1.0, 1.3)))
+                self.out.append(_cars(x, y, yaw + rng.normal() * 0.03, looks))
+            s += looks[0] + rng.uniform(0.6, 3)
+
+    def pavement(self):
+        """Trees, lamps, signs and boxes."""
+        rng, u, side, edge, s = self.rng, self.rng.uniform, self.side, self.edge, 0.0
+        while s < self.length:
             what = rng.random()
             if what < 0.35:
-                tree(s, side * (edge + u(2.2, 3)))
+                self.tree(s, side * (edge + u(2.2, 3)))
             elif what < 0.7:
-                put(s, side * (edge + u(0.5, 2.5)), r := u(0.04, 0.12), r, 0, u(2.5, 8), u(0.2, 0.6), round_=1)
+                self.put(s, side * (edge + u(0.5, 2.5)), r := u(0.04, 0.12), r, 0, u(2.5, 8), u(0.2, 0.6), round_=1)
             elif what < 0.9:
-                put(s, side * (edge + u(2.2, 3)), u(0.2, 0.6), u(0.2, 0.4), 0, u(0.7, 1.7), u(0.1, 0.6))
+                self.put(s, side * (edge + u(2.2, 3)), u(0.2, 0.6), u(0.2, 0.4), 0, u(0.7, 1.7), u(0.1, 0.6))
             s += u(3, 14)
-    for _ in range(int(length / 4)):  # what one sees between the houses
-        s, left, house = u(0, length), rng.choice([-1, 1]) * u(20, 70), rng.random() < 0.4
-        put(s, left, u(4, 12), u(4, 8), 0, u(4, 12), u(0.2, 0.4), twist=rng.normal() * 0.3) if house else tree(s, left)
-    return _clear_of_the_road(np.concatenate(out), at, length)
+
+    def distance(self):
+        """What one sees between the houses, on both sides."""
+        rng, u = self.rng, self.rng.uniform
+        for _ in range(int(self.length / 4)):
+            s, left, house = u(0, self.length), rng.choice([-1, 1]) * u(20, 70), rng.random() < 0.4
+            if house:
+                self.put(s, left, u(4, 12), u(4, 8), 0, u(4, 12), u(0.2, 0.4), twist=rng.normal() * 0.3)
+            else:
+                self.tree(s, left)
+
+
+def _roadside(rng, at, length, odds):
+    """Everything that stands along a road of `length` m -> (n,10) prisms; what would stand on the road is taken away again."""
+    zones = rng.choice(3, p=np.array(odds) / sum(odds), size=(2, int(length / 70) + 1))
+    left, right = (_Street(rng, at, length, side, edge, zones[(side + 1) // 2]) for side, edge in ((1, 1.5 * LANE), (-1, 0.5 * LANE)))
+    for street in left, right:
+        street.plots()
+        street.parked_cars()
+        street.pavement()
+    right.distance()
+    return _clear_of_the_road(np.concatenate(left.out + right.out), at, length)
 
 
 def _clear_of_the_road(out, at, length):
