@@ -235,7 +235,7 @@ GEOMETRY = 3    # raise when scan_geometry changes, so that older caches are not
 
 def scan_geometry(scan: np.ndarray, config: Config = Config()) -> np.ndarray:
     """Sampling and grouping of all three set abstractions: scan (N,4) -> record of `geometry_dtype`. FPS is nested, so one
-    sampling serves them all. Points that are not finite or beyond MAX_RANGE are left out, and of absurd intensity; ValueError when too few remain."""
+    sampling serves them all. Points that are not finite, beyond MAX_RANGE or of absurd intensity are left out; ValueError when too few remain."""
     with np.errstate(over="ignore"):
         scan = np.asarray(scan, np.float32)
     if scan.ndim != 2 or scan.shape[1] != 4:
@@ -318,7 +318,8 @@ def load_geometry(sequences, config, cache="cache"):
         depends = (GEOMETRY, fingerprint(s), [p.stat().st_mtime_ns for p in s.scan_paths], dtype.descr, config.sa1.r, config.sa2.r,
                    config.sa3.r, [(scale.r, scale.n_n) for scale in config.scales], config.spread, config.plane, MAX_RANGE)
         files.append(Path(cache) / f"{s.name}-{hashlib.sha256(repr(depends).encode()).hexdigest()[:16]}.npy")
-    missing = [(s, file) for s, file in zip(sequences, files) if _cached(file, dtype, len(s)) is None]
+    geometry = [_cached(file, dtype, len(s)) for s, file in zip(sequences, files)]
+    missing = [(s, file) for s, file, records in zip(sequences, files, geometry) if records is None]
     if missing:
         paths = [path for s, _ in missing for path in s.scan_paths]
         pool = ProcessPoolExecutor(kitti.cores(), initializer=kitti.worker_starts)
@@ -334,7 +335,7 @@ def load_geometry(sequences, config, cache="cache"):
             next(records, None)                         # lets the progress line end
         finally:
             pool.shutdown(cancel_futures=True)
-    geometry = [np.load(file, mmap_mode="r") for file in files]
+    geometry = [np.load(file, mmap_mode="r") if records is None else records for file, records in zip(files, geometry)]
     for s, records in zip(sequences, geometry):
         if records["dropped"].any():
             print(f"sequence {s.name}: left out {records['dropped'].sum()} NaN or infinite points in "
@@ -796,6 +797,17 @@ def interruption_waits():
             signal.signal(number, handler)
 
 
+def training_step(objective, net, batch, target, minimizers):
+    """Loss of a batch, after which the optimisers and their schedules go one step on. Returns it, and the learning rate."""
+    loss, rate = objective(net.train()(batch), target), minimizers[0].param_groups[0]["lr"]
+    net.zero_grad()
+    objective.zero_grad()
+    loss.backward()
+    for part in minimizers:
+        part.step()
+    return loss.item(), rate
+
+
 def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=print, **remember):
     """Train `net` as its config says (section 4). Returns a net for use, with BatchNorm's statistics recomputed.
 
@@ -833,15 +845,9 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
     todo = batches(geometry, motions, config, (seed,), step, total, device)
     with interruption_waits() as came:
         for batch, target in progress(todo, total - step, f"training, batches of {config.batch} pairs, swap: {config.swap}"):
-            loss = objective(net.train()(batch), target)
-            net.zero_grad()
-            objective.zero_grad()
-            loss.backward()
-            rate = parts["scheduler0"].get_last_lr()[0]
-            for part in list(parts.values())[2:]:
-                part.step()
+            loss, rate = training_step(objective, net, batch, target, list(parts.values())[2:])
             step += 1
-            losses.append(loss.item())
+            losses.append(loss)
             if step % per_epoch == 0:
                 say(f"epoch {step // per_epoch}/{config.epochs}: loss {np.mean(losses):.4f}, learning rate {rate:.1e}")
                 losses = []
@@ -862,76 +868,82 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
 
 # ----------------------------------------------------------------------------------------------- sections 5 and 6: evaluation
 
-def evaluate_network(net, state, sequences, geometry, out, source, device="cpu", refine=0):
-    """Run the network over sequences, write OUT/NN.txt (KITTI pose files) and OUT/results.json (with `source`), return the table.
-    `refine`: see `predict_motions`.
+PREDICTORS = "network", "standing still", "mean motion of training"        # the last two show what little is worth
 
-    Beside the network stand two trivial predictors: standing still, and the mean motion of the training set. Rows whose data
-    the weights were trained on are marked, by the data's fingerprint and not by name.
-    """
+
+def run_network(net, state, s, records, out, device="cpu", refine=0):
+    """Run the network over a sequence and write OUT/NN.txt, a KITTI pose file -> {predictor: (segment errors, step errors)}, empty
+    without ground truth. `refine`: see `predict_motions`."""
+    strange = [words for words in (unlike(looks, state["seen"]) for looks in records["looks"]) if words]
+    if strange:
+        print(f"sequence {s.name}: {len(strange)} of {len(s)} scans are unlike those the weights were trained on, do not trust the answer: "
+              f"{strange[0]}", file=sys.stderr)
+    motions, errors = predict_motions(net, records, device, refine=refine), {}
+    constant = (np.broadcast_to(T, motions.shape) for T in (np.eye(4), from_vector(state["mean_motion"])))
+    for predictor, T in zip(PREDICTORS, (motions, *constant)):
+        poses = accumulate(T)
+        poses_cam = kitti.velo_to_camera(poses, s.Tr)
+        if predictor == "network":
+            metrics.write_poses(out / f"{s.name}.txt", poses_cam)
+        if s.poses is not None:
+            errors[predictor] = metrics.segment_errors(s.poses_cam, poses_cam), metrics.step_errors(s.poses, poses)
+    return errors
+
+
+def zip_for_server(out, names):
+    """OUT/kitti-server.zip as KITTI's server wants it, when its eleven sequences without ground truth are among the names."""
+    server = [str(i) for i in range(11, 22)]
+    if not set(server) <= set(names):
+        return ""
+    with metrics.replacing(out / "kitti-server.zip") as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in server:                                     # in its root, as the devkit's readme wants them
+            archive.write(out / f"{name}.txt", f"{name}.txt")
+    return f"\nto submit     {out}/kitti-server.zip"
+
+
+def evaluate_network(net, state, sequences, geometry, out, source, device="cpu", refine=0):
+    """`run_network` over sequences, write OUT/results.json (with `source`), return the table. Rows whose data the weights were trained
+    on are marked, by the data's fingerprint and not by name."""
     out = Path(out)
-    constant = {"standing still": np.eye(4), "mean motion of training": from_vector(state["mean_motion"])}
-    scores = {predictor: {} for predictor in ("network", *constant)}      # predictor -> sequence -> segment and step errors
-    for s, records in progress(zip(sequences, geometry), len(sequences), "registering, sequences"):
-        strange = [words for words in (unlike(looks, state["seen"]) for looks in records["looks"]) if words]
-        if strange:
-            print(f"sequence {s.name}: {len(strange)} of {len(s)} scans are unlike those the weights were trained on, do not trust the answer: "
-                  f"{strange[0]}", file=sys.stderr)
-        motions = {"network": predict_motions(net, records, device, refine=refine)}
-        motions |= {name: np.broadcast_to(T, motions["network"].shape) for name, T in constant.items()}
-        for predictor, T in motions.items():
-            poses = accumulate(T)
-            poses_cam = kitti.velo_to_camera(poses, s.Tr)
-            if predictor == "network":
-                metrics.write_poses(out / f"{s.name}.txt", poses_cam)
-            if s.poses is not None:
-                scores[predictor][s.name] = metrics.segment_errors(s.poses_cam, poses_cam), metrics.step_errors(s.poses, poses)
+    errors = {s.name: run_network(net, state, s, records, out, device, refine)
+              for s, records in progress(zip(sequences, geometry), len(sequences), "registering, sequences")}
     trained_on = {s.name: fingerprint(s) in state["train"].values() for s in sequences}
 
     def summary(names, predictor="network"):
-        pooled = [scores[predictor][name] for name in names if name in scores[predictor]]
-        return metrics.summary([e for e, _ in pooled], [e for _, e in pooled]) | {"trained_on": any(trained_on[n] for n in names)}
+        some = [errors[name][predictor] for name in names if errors[name]]
+        return metrics.summary([e for e, _ in some], [e for _, e in some]) | {"trained_on": any(trained_on[n] for n in names)}
 
-    splits = {split: [n for n in names if n in trained_on] for split, names in SPLITS.items()}
-    parts = {split: names for split, names in splits.items() if names} | {"all": list(trained_on)}
-    each = {name: summary([name]) for name in trained_on}
-    pooled = {group: {p: summary(names, p) for p in scores} for group, names in parts.items()}
-    lengths = metrics.by_length([segments for segments, _ in scores["network"].values()])
-    results = {**source, "sequences": each, "lengths": lengths, "splits": {g: p["network"] for g, p in pooled.items() if g != "all"},
-               "pooled": pooled["all"]["network"], "predictors": {c: {g: p[c] for g, p in pooled.items()} for c in constant}}
+    parts = {split: [n for n in names if n in errors] for split, names in SPLITS.items()} | {"all": list(errors)}
+    each = {name: summary([name]) for name in errors}
+    pooled = {part: {p: summary(names, p) for p in PREDICTORS} for part, names in parts.items() if names}
+    lengths = metrics.by_length([e["network"][0] for e in errors.values() if e])
+    results = {**source, "sequences": each, "lengths": lengths, "splits": {part: p["network"] for part, p in pooled.items() if part != "all"},
+               "pooled": pooled["all"]["network"], "predictors": {p: {part: s[p] for part, s in pooled.items()} for p in PREDICTORS[1:]}}
     plain = json.loads(json.dumps(results), parse_constant=lambda nan: None)    # JSON has no NaN
     with metrics.replacing(out / "results.json") as temporary:
         temporary.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
-    written = f"trajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)\nfigures       {out}/results.json"
-    server = [str(i) for i in range(11, 22)]                    # KITTI's sequences without ground truth
-    if set(server) <= trained_on.keys():
-        with metrics.replacing(out / "kitti-server.zip") as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name in server:                                 # in its root, as the devkit's readme wants them
-                archive.write(out / f"{name}.txt", f"{name}.txt")
-        written += f"\nto submit     {out}/kitti-server.zip"
+
     rows = [metrics.row(name + " *" * s["trained_on"], s) for name, s in each.items()]
-    for group, predictions in pooled.items():
-        rows += [metrics.row(group + " *" * s["trained_on"] if p == "network" else f"  {p}", s) for p, s in predictions.items()]
+    for part, predictions in pooled.items():
+        rows += [metrics.row(part + " *" * s["trained_on"] if p == "network" else f"  {p}", s) for p, s in predictions.items()]
     rows += [metrics.row(length, s) for length, s in lengths.items()]
     return (metrics.table(metrics.HEADER, rows) + "\n*: trained on. E_t, E_r: KITTI's segments of 100 to 800 m, rectified left camera "
             "frame. t step, r step: mean length and\nangle of inv(T_est) @ T_true of a step, Velodyne frame. -: no such segment, or no "
-            f"ground truth.\n{written}")
+            f"ground truth.\ntrajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)\nfigures       {out}/results.json"
+            + zip_for_server(out, errors))
 
 
 # ------------------------------------------------------------------------------------------------------------- command line
 
-def train(data=None, sequences=None, out=None, epochs=None, batch=None, neighbors=None, plane=True, seed=0, device="cpu", short=False,
-          resume=False, config=None):
-    """The command `train`: train on `sequences` of `data` (None: the simulated city), evaluate on what there is of the test and
-    validation splits beside them. `config` takes the place of the options it holds. Returns the run folder. ValueError, FileNotFoundError."""
+def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu", resume=False):
+    """The command `train`: train on `sequences` of `data` (None: the simulated city) as `config` says (None: the paper's, or the short
+    recipe without data), evaluate on what there is of the test and validation splits beside them. Returns the run folder. ValueError,
+    FileNotFoundError."""
     check_device(device)
     run = Path(out or time.strftime("runs/%Y-%m-%d-%H%M%S"))
     if (run / "config.json").exists() and not resume:
         raise ValueError(f"{run}: holds a training already; add --resume to go on with it, or choose another --out")
-    if not config:
-        config = Config(**(SHORT if short or not data else {}), plane=plane)
-        config = replace(config, epochs=epochs or config.epochs, batch=batch or config.batch,
-                         sa1=config.sa1._replace(n_n=neighbors or config.sa1.n_n))
+    config = config or Config(**({} if data else SHORT))
     if resume:
         config, data, sequences, seed = begun_with(run)
     data = data and str(Path(data).resolve())
@@ -951,13 +963,7 @@ def train(data=None, sequences=None, out=None, epochs=None, batch=None, neighbor
     looks = np.concatenate([records["looks"] for records in geometry[:len(chosen)]])
     remember["seen"] = [looks.min(0).tolist(), looks.max(0).tolist()]
 
-    run.mkdir(parents=True, exist_ok=True)
-    arguments = dict(data=data, sequences=names, seed=seed, device=device)
-    versions = {"d3dlo": revision(), "python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__,
-                "torch": torch.__version__}
-    begun = dict(arguments=arguments, config=config.as_dict(), versions=versions, fingerprints=remember["train"])
-    with metrics.replacing(run / "config.json") as temporary:
-        temporary.write_text(json.dumps(begun, indent=1) + "\n")
+    note_beginning(run, dict(data=data, sequences=names, seed=seed, device=device), config, remember["train"])
 
     def say(line):
         print(line, flush=True)
@@ -983,7 +989,8 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     net, state = load_weights(weights, device)
     out = Path(out or time.strftime("results/%Y-%m-%d-%H%M%S"))
     sequences = sequences or ("all" if data else ("test", "validation"))
-    root = Path(data) if data else kitti.simulate(SIMULATED, sequences=sequences)
+    known = {"all", *SPLITS, *sum(SPLITS.values(), ())}         # of a misspelt name no city is made
+    root = Path(data) if data else kitti.simulate(SIMULATED, sequences=[name for name in sequences if name in known])
     chosen = kitti.open_sequences(root, sequences)
     for s in chosen:
         if s.poses is None and (s.folder / "poses.txt").exists():
@@ -1023,6 +1030,15 @@ def revision():
         return git.stdout.strip() if (here / ".git").exists() else None
     except OSError:                                     # no git
         return None
+
+
+def note_beginning(run, arguments, config, fingerprints):
+    """RUN/config.json: all that is needed to repeat a training, or to go on with it."""
+    versions = {"d3dlo": revision(), "python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__,
+                "torch": torch.__version__}
+    begun = dict(arguments=arguments, config=config.as_dict(), versions=versions, fingerprints=fingerprints)
+    with metrics.replacing(run / "config.json") as temporary:
+        temporary.write_text(json.dumps(begun, indent=1) + "\n", encoding="utf-8")
 
 
 def begun_with(run):
@@ -1087,7 +1103,10 @@ def main(argv=None):
         else:
             if args["resume"] and any(args[k] != t.get_default(k) for k in args.keys() - {"resume", "out", "device"}):
                 raise ValueError("--resume goes on with the options the run was begun with; give only --out RUN, and --device")
-            train(**args)
+            config = Config(**(SHORT if args.pop("short") or not args["data"] else {}), plane=args.pop("plane"))
+            epochs, batch, n_n = (args.pop(name) for name in ("epochs", "batch", "neighbors"))
+            train(replace(config, epochs=epochs or config.epochs, batch=batch or config.batch,
+                          sa1=config.sa1._replace(n_n=n_n or config.sa1.n_n)), **args)
     except KeyboardInterrupt as interruption:
         print(f"\nd3dlo: interrupted; {str(interruption) or 'run it again; a training goes on by train --out RUN --resume'}", file=sys.stderr)
         return 130

@@ -118,7 +118,7 @@ def child(run, config, root, sequences, evaluated, seed):
     """What `run_one` runs: train, or go on, and evaluate."""
     torch.set_num_threads(1)
     d3dlo.keep_freed_memory()
-    d3dlo.train(root, sequences, run, seed=seed, config=Config(**config), resume=(Path(run) / "config.json").exists())
+    d3dlo.train(Config(**config), root, sequences, run, seed=seed, resume=(Path(run) / "config.json").exists())
     d3dlo.evaluate(root, run, evaluated, out=Path(run) / "all")
 
 
