@@ -39,7 +39,6 @@ from kitti import SPLITS, from_vector, invert, progress, to_vector
 WEIGHTS = Path(__file__).with_name("d3dlo.pt")      # the weights shipped
 SIMULATED = Path("data/simulated")                  # made under the current folder when no --data is given
 STORE_EVERY = 300.0                                 # s, from one checkpoint of a training to the next
-MAX_RANGE = 100.0                                   # m; KITTI ends at 81 m, and one stray return must not become a centroid
 
 
 # ---------------------------------------------------------------------------------------------------- Table 1 and the choices
@@ -64,6 +63,7 @@ class Config:
     mlp: Layer = Layer(None, None, None, (64, 6))
 
     spread: int = 1             # which n_n of a ball: the nearest, or in even steps of the nearest spread * n_n
+    max_range: float = 50.0     # m; ours: what is further is left out. 1,024 points spread over 80 m lie too far apart for Table 1's balls
     plane: bool = True          # keep the points of the ground plane, Table 2's "pp"
     epochs: int = 500           # section 4
     batch: int = 16             # pairs; ours
@@ -93,6 +93,8 @@ class Config:
             raise ValueError("Config: n_fps of sa1, sa2, sa3 must not grow, and stay below 65,536")
         if min(self.epochs, self.batch, self.spread, *(layer.n_n for layer in grouping)) < 1:
             raise ValueError("Config: epochs, batch, spread and every n_n must be 1 or more")
+        if not (0 < self.lr < math.inf and 0 < self.max_range < math.inf):
+            raise ValueError("Config: lr and max_range must be above 0")
         if len(self.mlp.mlp) != 2 or self.mlp.mlp[1] not in (6, 7):
             raise ValueError("Config: mlp has two layers, the last of 6 outputs (Euler angles) or 7 (quaternion)")
         for name, choices in (("optimizer", ("adam", "muon")), ("schedule", ("steps", "one-cycle")), ("swap", ("both", "random", "off")),
@@ -235,7 +237,7 @@ GEOMETRY = 3    # raise when scan_geometry changes, so that older caches are not
 
 def scan_geometry(scan: np.ndarray, config: Config = Config()) -> np.ndarray:
     """Sampling and grouping of all three set abstractions: scan (N,4) -> record of `geometry_dtype`. FPS is nested, so one
-    sampling serves them all. Points that are not finite, beyond MAX_RANGE or of absurd intensity are left out; ValueError when too few remain."""
+    sampling serves them all. Points that are not finite, beyond config.max_range or of absurd intensity are left out; ValueError when too few remain."""
     with np.errstate(over="ignore"):
         scan = np.asarray(scan, np.float32)
     if scan.ndim != 2 or scan.shape[1] != 4:
@@ -243,12 +245,12 @@ def scan_geometry(scan: np.ndarray, config: Config = Config()) -> np.ndarray:
     x, y, z, intensity = scan.T
     with np.errstate(over="ignore", invalid="ignore"):
         finite = np.isfinite(x + y + z) & (np.abs(intensity) < 65536)       # no sensor gives more; it would end as NaN
-        scan = np.ascontiguousarray(scan[finite & (x * x + y * y + z * z < MAX_RANGE ** 2)])
+        scan = np.ascontiguousarray(scan[finite & (x * x + y * y + z * z < config.max_range ** 2)])
     if not config.plane:
         scan = kitti.remove_plane(scan)
     n1, (r2, n2, k2, _), (r3, n3, k3, _) = config.sa1.n_fps, config.sa2, config.sa3
     if len(scan) < n1:
-        usable = f"finite, nearer than {MAX_RANGE:.0f} m, intensity below 65,536" + ("" if config.plane else ", off the ground")
+        usable = f"finite, nearer than {config.max_range:.0f} m, intensity below 65,536" + ("" if config.plane else ", off the ground")
         raise ValueError(f"{len(scan)} usable points ({usable}), at least {n1} are needed")
     cloud = np.ascontiguousarray(scan[:, :3])
     with ThreadPoolExecutor(1) as aside:
@@ -316,7 +318,7 @@ def load_geometry(sequences, config, cache="cache"):
     files = []
     for s in sequences:
         depends = (GEOMETRY, fingerprint(s), [p.stat().st_mtime_ns for p in s.scan_paths], dtype.descr, config.sa1.r, config.sa2.r,
-                   config.sa3.r, [(scale.r, scale.n_n) for scale in config.scales], config.spread, config.plane, MAX_RANGE)
+                   config.sa3.r, [(scale.r, scale.n_n) for scale in config.scales], config.spread, config.plane, config.max_range)
         files.append(Path(cache) / f"{s.name}-{hashlib.sha256(repr(depends).encode()).hexdigest()[:16]}.npy")
     geometry = [_cached(file, dtype, len(s)) for s, file in zip(sequences, files)]
     missing = [(s, file) for s, file, records in zip(sequences, files, geometry) if records is None]
@@ -935,18 +937,22 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu",
 
 # ------------------------------------------------------------------------------------------------------------- command line
 
-def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu", resume=False):
+def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu", resume=False, weights=None):
     """The command `train`: train on `sequences` of `data` (None: the simulated city) as `config` says (None: the paper's, or the short
-    recipe without data), evaluate on what there is of the test and validation splits beside them. Returns the run folder. ValueError,
-    FileNotFoundError."""
+    recipe without data), evaluate on what there is of the test and validation splits beside them. With `weights` it begins from those,
+    whose network is kept; of `config` then count the fields that SHORT has. Returns the run folder. ValueError, FileNotFoundError."""
     check_device(device)
     run = Path(out or time.strftime("runs/%Y-%m-%d-%H%M%S"))
     if (run / "config.json").exists() and not resume:
         raise ValueError(f"{run}: holds a training already; add --resume to go on with it, or choose another --out")
     config = config or Config(**({} if data else SHORT))
     if resume:
-        config, data, sequences, seed = begun_with(run)
-    data = data and str(Path(data).resolve())
+        config, data, sequences, seed, weights = begun_with(run)
+    data, weights = (path and str(Path(path).resolve()) for path in (data, weights))
+    before = {"train": {}, "seen": []}
+    if weights:
+        first, before = load_weights(weights)
+        config = replace(first.config, **{name: getattr(config, name) for name in SHORT})
     root = Path(data) if data else kitti.simulate(SIMULATED)
     there = [s.name for s in kitti.open_sequences(root)]
     chosen = kitti.open_sequences(root, sequences or ("train" if set(SPLITS["train"]) & set(there) else "all"))
@@ -954,16 +960,16 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     if not sum(map(len, motions)):
         raise ValueError(f"{root}: sequence {' '.join(names)} has a single scan; training needs pairs")
     held_out = kitti.open_sequences(root, [n for n in SPLITS["test"] + SPLITS["validation"] if n in there and n not in names])
-    remember = {"train": {s.name: fingerprint(s) for s in chosen},
+    remember = {"train": {f"{name}, before": digest for name, digest in before["train"].items()} | {s.name: fingerprint(s) for s in chosen},
                 "mean_motion": to_vector(np.concatenate(motions)).mean(0).tolist()}
     state = load_weights(run / "checkpoint.pt", device)[1] if resume and (run / "checkpoint.pt").exists() else None
     if state and state["train"] != remember["train"]:
         raise ValueError(f"{run}/checkpoint.pt: was trained on other data than lies there now; resume with the data it was begun with")
     geometry = load_geometry(chosen + held_out, config)
-    looks = np.concatenate([records["looks"] for records in geometry[:len(chosen)]])
+    looks = np.concatenate([*(records["looks"] for records in geometry[:len(chosen)]), np.reshape(before["seen"], (-1, len(LOOKS)))])
     remember["seen"] = [looks.min(0).tolist(), looks.max(0).tolist()]
 
-    note_beginning(run, dict(data=data, sequences=names, seed=seed, device=device), config, remember["train"])
+    note_beginning(run, dict(data=data, sequences=names, seed=seed, device=device, weights=weights), config, remember["train"])
 
     def say(line):
         print(line, flush=True)
@@ -972,6 +978,8 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
 
     torch.manual_seed(seed)
     net = D3DLO(config).to(device)
+    if weights:
+        net.load_state_dict(first.state_dict())
     say(f"{sum(p.numel() for p in net.parameters()):,} parameters, {sum(map(len, motions)):,} pairs of scans, {config.epochs} epochs of "
         f"{steps_per_epoch(motions, config)} batches -> {run}")
     net = fit(net, geometry[:len(chosen)], motions, run, seed, device, state, say, **remember)
@@ -1042,10 +1050,10 @@ def note_beginning(run, arguments, config, fingerprints):
 
 
 def begun_with(run):
-    """Config, data, sequences and seed a training was begun with, from RUN/config.json."""
+    """Config, data, sequences, seed and weights a training was begun with, from RUN/config.json."""
     try:
         begun = json.loads((run / "config.json").read_text(encoding="utf-8"))
-        return Config(**begun["config"]), *(begun["arguments"][name] for name in ("data", "sequences", "seed"))
+        return Config(**begun["config"]), *(begun["arguments"][name] for name in ("data", "sequences", "seed", "weights"))
     except (ValueError, KeyError, TypeError, OSError):
         raise ValueError(f"{run}/config.json: missing or damaged, so there is no training to go on with; give its folder by --out") from None
 
@@ -1071,6 +1079,7 @@ def main(argv=None):
     t = commands.add_parser("train", formatter_class=raw, help="train, then evaluate on the test and validation splits", description=(
         "Train D3DLO, then evaluate it on the test and validation splits.\n\n  python d3dlo.py train\n"
         "  python d3dlo.py train --data ROOT\n  python d3dlo.py train --data ROOT --sequences 00 01 --short --epochs 20\n"
+        "  python d3dlo.py train --data ROOT --weights d3dlo.pt --short --lr 0.002\n"
         "  python d3dlo.py train --out RUN --resume"))
     e = commands.add_parser("eval", formatter_class=raw, help="trajectories and KITTI's errors", description=(
         "Run D3DLO over sequences, write their trajectories, print KITTI's errors.\n\n  python d3dlo.py eval\n"
@@ -1083,6 +1092,8 @@ def main(argv=None):
     t.add_argument("--epochs", type=positive, metavar="N", help=f"default: {Config.epochs}, short {SHORT['epochs']}")
     t.add_argument("--batch", type=positive, metavar="N",
                    help=f"pairs in a batch, each both ways (default: {Config.batch}, short {SHORT['batch']})")
+    t.add_argument("--lr", type=float, metavar="X", help=f"learning rate, at its highest (default: {Config.lr}, short {SHORT['lr']})")
+    t.add_argument("--weights", metavar="FILE|RUN", help="begin from these weights, with their network, and not from random ones")
     t.add_argument("--neighbors", type=positive, metavar="N", help=f"n_n of the first set abstraction, Table 2 (default: {Config.sa1.n_n})")
     t.add_argument("--no-plane", action="store_false", dest="plane", help="leave out the points of the ground plane, Table 2")
     t.add_argument("--seed", type=number, default=0, metavar="N",
@@ -1103,10 +1114,11 @@ def main(argv=None):
         else:
             if args["resume"] and any(args[k] != t.get_default(k) for k in args.keys() - {"resume", "out", "device"}):
                 raise ValueError("--resume goes on with the options the run was begun with; give only --out RUN, and --device")
+            if args["weights"] and (args["neighbors"] or not args["plane"]):
+                raise ValueError("--weights brings its network along; leave out --neighbors and --no-plane")
             config = Config(**(SHORT if args.pop("short") or not args["data"] else {}), plane=args.pop("plane"))
-            epochs, batch, n_n = (args.pop(name) for name in ("epochs", "batch", "neighbors"))
-            train(replace(config, epochs=epochs or config.epochs, batch=batch or config.batch,
-                          sa1=config.sa1._replace(n_n=n_n or config.sa1.n_n)), **args)
+            n_n, given = args.pop("neighbors"), {name: args.pop(name) for name in ("epochs", "batch", "lr")}
+            train(replace(config, **{name: x for name, x in given.items() if x is not None}, sa1=config.sa1._replace(n_n=n_n or config.sa1.n_n)), **args)
     except KeyboardInterrupt as interruption:
         print(f"\nd3dlo: interrupted; {str(interruption) or 'run it again; a training goes on by train --out RUN --resume'}", file=sys.stderr)
         return 130

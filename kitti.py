@@ -235,11 +235,12 @@ def remove_plane(scan: np.ndarray, threshold=0.15, max_tilt=15.0, hypotheses=400
 # ---------------------------------------------------------------------------------------------------- the simulated city
 # The world is vertical prisms on a ground, one row each: yawed boxes and upright cylinders. It is flat, and hills bend it afterwards.
 X, Y, YAW, HALF_X, HALF_Y, Z0, Z1, ALBEDO, FUZZ, ROUND = range(10)  # m, radians; FUZZ: depth [m] to which foliage lets light in; ROUND: a cylinder
-CITY = 2  # raise when the city changes, so that scans of two versions are never mixed
+CITY = 3  # raise when the city changes, so that scans of two versions are never mixed
 ELEVATION = np.radians(np.r_[np.linspace(-24.33, -8.83, 32), np.linspace(-8.33, 2.0, 32)])  # the HDL-64E's 64 beams, bottom to top
 SENSOR_HEIGHT, MIN_RANGE, CITY_RANGE = 1.73, 2.5, 80.0  # m
 LANE = 3.5  # m; we keep to the right lane of two, so the road reaches from 1.75 m right to 5.25 m left of our path
 CELL = 0.5  # m, of the ground's raster
+RELIEF = 0.4  # m, depth of windows and doors in what is higher than 3 m
 SCANS = {"train": 320, "test": 170, "validation": 170}  # per sequence: enough for 100 m segments, few enough to make on the spot
 # what a sequence is like: cruising speed [m/s], odds of a street corner every 35-80 m (faster, further), stops, odds of (dense, suburban, open) surroundings
 STYLES = {"00": (12, 0.55, 0, (6, 3, 1)), "01": (26, 0.15, 0, (1, 3, 12)), "02": (15, 0.4, 0, (1, 6, 2)), "08": (12, 0.5, 1, (4, 4, 1)),
@@ -351,9 +352,9 @@ class _Street:
 
     def tree(self, s, left):
         u = self.rng.uniform
-        radius, crown = u(0.1, 0.3), u(1.8, 3.4)
+        radius, crown = u(0.1, 0.3), u(1.2, 3.2)
         self.put(s, left, radius, radius, 0, crown + 1, u(0.15, 0.35), round_=1)
-        self.put(s, left, r := u(1.2, 2.8), r, crown, crown + u(3, 6), u(0.2, 0.45), fuzz=u(0.3, 1.5), round_=1)
+        self.put(s, left, r := u(1.2, 3.5), r, crown, crown + u(3, 7), u(0.2, 0.45), fuzz=u(0.5, 2.5), round_=1)
 
     def plots(self):
         """Houses and gardens, one plot after the other."""
@@ -370,7 +371,7 @@ class _Street:
             if kind and rng.random() < 0.65:  # the border of the plot: a hedge, a wall or a fence
                 hedge = rng.random() < 0.6
                 put(mid, side * (edge + u(2.2, 3.2)), plot * u(0.3, 0.48), 0.35 if hedge else 0.1, 0, u(0.6, 1.9), u(0.2, 0.4), fuzz=0.25 * hedge)
-            for _ in range(rng.poisson((0.3, 1.2, 1.5)[kind])):  # trees and bushes of the garden
+            for _ in range(rng.poisson((0.6, 2, 2)[kind])):  # trees and bushes of the garden
                 self.tree(s + u(0, 1) * plot, side * u(edge + 3, back + 3))
                 put(s + u(0, 1) * plot, side * (edge + u(3, 7)), r := u(0.4, 1.2), r, 0, u(0.5, 1.8), u(0.2, 0.4), fuzz=0.25, round_=1)
             s += plot + (u(5, 14) if kind or rng.random() < 0.35 else u(0, 1))  # a gap, at times a side street
@@ -400,12 +401,14 @@ class _Street:
     def distance(self):
         """What one sees between the houses, on both sides."""
         rng, u = self.rng, self.rng.uniform
-        for _ in range(int(self.length / 4)):
-            s, left, house = u(0, self.length), rng.choice([-1, 1]) * u(20, 70), rng.random() < 0.4
+        for _ in range(int(self.length / 2)):
+            s, left, house = u(0, self.length), rng.choice([-1, 1]) * u(12, 75), rng.random() < 0.3
             if house:
                 self.put(s, left, u(4, 12), u(4, 8), 0, u(4, 12), u(0.2, 0.4), twist=rng.normal() * 0.3)
-            else:
+            elif rng.random() < 0.4:
                 self.tree(s, left)
+            else:  # a thicket, the edge of a wood
+                self.put(s, left, u(1, 8), u(1, 4), 0, u(1, 8), u(0.2, 0.45), fuzz=u(1, 4), twist=rng.normal() * 0.5)
 
 
 def _roadside(rng, at, length, odds):
@@ -559,8 +562,14 @@ def _meet_prisms(p, eye, rays, rng):
     best = reach <= d[ray]
     hit, g, flat = ray[best], g[best], (above | below)[best]
     cosine[hit] = np.where(flat, np.abs(rays.sin_w[hit]), facing[g] * rays.cos_w[hit])
-    shade[hit], blur[hit] = p[k, ALBEDO].astype(f4)[g], fuzz[g]
+    shade[hit], blur[hit] = p[k, ALBEDO].astype(f4)[g], np.where(fuzz > 0, fuzz, RELIEF * (z1 - z0 > 3))[g]
     return out
+
+
+def _rough(x, y, z):
+    """How deep light gets into foliage, or into the windows and doors of a facade, at (x, y, z) in the world: 0 to 1, the same in every scan."""
+    a, b, c = (np.floor(v / 0.6).astype(np.int64) for v in (x, y, z))
+    return ((a * 73856093 ^ b * 19349663 ^ c * 83492791) % 1009).astype(np.float32) / 1009
 
 
 def _meet_ground(met, ground, eye, rays):
@@ -594,7 +603,9 @@ def _simulate_scan(name, seed, scans, azimuth, i):
     ray = np.flatnonzero(met[0] < CITY_RANGE)
     d, cosine, shade, blur = met[:, ray]
     noise = lambda: rng.standard_normal(len(ray), dtype=f4)
-    r = d / rays.cos_w[ray] + 0.02 * noise() + blur * rng.random(len(ray), dtype=f4)
+    col = ray % azimuth
+    rough = _rough(eye[0] + d * rays.cos_a[col], eye[1] + d * rays.sin_a[col], eye[2] + d * rays.slope[ray])
+    r = d / rays.cos_w[ray] + 0.02 * noise() + blur * (0.8 * rough + 0.2 * rng.random(len(ray), dtype=f4))
     lost = 0.01 + 0.10 * (r / 40) ** 2 * (0.15 / (0.05 + shade)) + 0.3 * np.exp(-cosine / 0.02) + 0.5 * np.exp(-shade / 0.03)
     light = shade * (0.65 + 0.4 * np.sqrt(cosine)) + 0.08 * noise() - 0.01 * np.maximum(r - 25, 0)  # from 60 m on KITTI's are mostly 0
     light *= rng.random(len(ray), dtype=f4) > 0.08
@@ -681,7 +692,7 @@ def _missing(root, names, seed, scans, azimuth):
     return jobs
 
 
-def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range(11)), scans=None, azimuth=1800, workers=None) -> Path:
+def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range(11)), scans=None, azimuth=2083, workers=None) -> Path:
     """Drives an HDL-64E through one simulated city per sequence and writes ROOT in KITTI's odometry layout with exact ground truth -> ROOT.
 
     sequences: names, splits or 'all'; scans: number per sequence (None: 320 for the training split, else 170; tests drive more than 115 m);

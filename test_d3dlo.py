@@ -177,7 +177,7 @@ def test_group_knn_equals_brute_force(seed, kind, N, k):
 def test_scan_geometry_is_fps_and_grouping_of_what_is_usable(seed, spread):
     rng = generator(seed)
     usable = cloud(rng, 200)
-    junk = np.float32([[np.nan, 0, 0, 0], [0, np.inf, 0, 0], [1, 1, 1, np.nan], [300, 0, 0, 0], [1e30, 0, 0, 0]])
+    junk = np.float32([[np.nan, 0, 0, 0], [0, np.inf, 0, 0], [1, 1, 1, np.nan], [0, 50.1, 0, 0], [1e30, 0, 0, 0]])
     g, xyz = scan_geometry(np.insert(usable, rng.integers(1, 200, len(junk)), junk, axis=0), replace(SMALL, spread=spread)), usable[:, :3]
     picks = fps_brute(xyz, 32)
     neighbours = usable[group_ball(xyz, picks, 2.0, 4, spread=spread)]
@@ -1040,6 +1040,21 @@ def test_train_then_eval_then_train_again(here, city, capsys):
     assert (here / "run" / "checkpoint.pt").read_bytes() == before
 
 
+def test_a_training_from_weights_begins_with_them_and_remembers_what_they_saw(here):
+    write_root(here / "first")
+    write_root(here / "later", size=1200)               # another sequence of the same name
+    d3dlo.train(replace(SMALL, epochs=1), "first", out="a")
+    d3dlo.train(Config(epochs=1, lr=1e-12), "later", out="b", weights="a")
+    (a, seen_a), (b, seen_b) = (load_weights(run) for run in "ab")
+    assert b.config == replace(a.config, epochs=1, batch=16, lr=1e-12) and a.config.sa1.n_fps == 32
+    assert all(torch.allclose(x, y, atol=1e-9) for x, y in zip(a.parameters(), b.parameters(), strict=True))
+    assert set(seen_a["train"].values()) < set(seen_b["train"].values()) and len(seen_b["train"]) == 2
+    (low_a, high_a), (low_b, high_b) = seen_a["seen"], seen_b["seen"]
+    assert np.all(np.array(low_b) <= low_a) and np.all(np.array(high_b) >= high_a)
+    d3dlo.evaluate("first", "b", out="results")
+    assert json.loads((here / "results" / "results.json").read_text())["sequences"]["00"]["trained_on"]
+
+
 def rewrite(name, change):
     return lambda root: (root / name).write_bytes(change((root / name).read_bytes()))
 
@@ -1075,6 +1090,7 @@ BAD_ARGUMENTS = {  # and what the complaint must name
     "eval --sequences 42": "42", "eval --sequences ../sequences/00": "../sequences/00", "train --sequences test": "test",
     "eval --data gone": "gone", "eval --weights gone.pt": "gone.pt", "eval --weights root": "root/weights.pt",
     "train --resume --out gone": "gone", "train --resume": "--out", "eval --device nonsense": "nonsense",
+    "train --weights gone.pt": "gone.pt", "train --weights gone.pt --no-plane": "--no-plane", "train --lr 0": "lr",
 }
 
 
