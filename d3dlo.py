@@ -1084,27 +1084,37 @@ def main(argv=None):
     e = commands.add_parser("eval", formatter_class=raw, help="trajectories and KITTI's errors", description=(
         "Run D3DLO over sequences, write their trajectories, print KITTI's errors.\n\n  python d3dlo.py eval\n"
         "  python d3dlo.py eval --data ROOT --sequences test\n  python d3dlo.py eval --data ROOT --weights RUN --sequences 11 12"))
+    device = dict(default="cpu", help="cpu, cuda or mps (default: cpu)")
     for p in (t, e):
-        p.add_argument("--data", metavar="ROOT", help=f"folder in KITTI odometry layout (default: a simulated city, made in {SIMULATED})")
-        p.add_argument("--sequences", nargs="+", metavar="NN", help="names, or splits: train, test, validation, all")
-        p.add_argument("--device", default="cpu", help="cpu, cuda or mps (default: cpu)")
-    t.add_argument("--out", metavar="RUN", help="folder of the run (default: runs/TIME)")
-    t.add_argument("--epochs", type=positive, metavar="N", help=f"default: {Config.epochs}, short {SHORT['epochs']}")
-    t.add_argument("--batch", type=positive, metavar="N",
-                   help=f"pairs in a batch, each both ways (default: {Config.batch}, short {SHORT['batch']})")
-    t.add_argument("--lr", type=float, metavar="X", help=f"learning rate, at its highest (default: {Config.lr}, short {SHORT['lr']})")
-    t.add_argument("--weights", metavar="FILE|RUN", help="begin from these weights, with their network, and not from random ones")
-    t.add_argument("--neighbors", type=positive, metavar="N", help=f"n_n of the first set abstraction, Table 2 (default: {Config.sa1.n_n})")
-    t.add_argument("--no-plane", action="store_false", dest="plane", help="leave out the points of the ground plane, Table 2")
-    t.add_argument("--seed", type=number, default=0, metavar="N",
-                   help="of the first weights, the order of pairs and the augmentation (default: 0)")
-    t.add_argument("--short", action="store_true", help="fewer epochs, one-cycle learning rate, augmentation (always without --data)")
-    t.add_argument("--resume", action="store_true", help="go on with the training in --out, with the options it was begun with")
-    e.add_argument("--weights", metavar="FILE|RUN", help="weights, or folder of a run (default: those shipped)")
-    e.add_argument("--refine", type=number, default=0, metavar="N", help=(
+        data = p.add_argument_group("data")
+        data.add_argument("--data", metavar="ROOT", help=f"folder in KITTI odometry layout (default: a simulated city, made in {SIMULATED})")
+        data.add_argument("--sequences", nargs="+", metavar="NN", help="names, or splits: train, test, validation, all")
+
+    network = t.add_argument_group("network")
+    network.add_argument("--weights", metavar="FILE|RUN", help="begin from these weights, with their network, and not from random ones")
+    network.add_argument("--neighbors", type=positive, metavar="N", help=f"n_n of the first set abstraction, Table 2 (default: {Config.sa1.n_n})")
+    network.add_argument("--no-plane", action="store_false", dest="plane", help="leave out the points of the ground plane, Table 2")
+    training = t.add_argument_group("training")
+    training.add_argument("--short", action="store_true", help="fewer epochs, one-cycle learning rate, Muon, augmentation (always without --data)")
+    training.add_argument("--epochs", type=positive, metavar="N", help=f"default: {Config.epochs}, short {SHORT['epochs']}")
+    training.add_argument("--batch", type=positive, metavar="N",
+                          help=f"pairs in a batch, each both ways (default: {Config.batch}, short {SHORT['batch']})")
+    training.add_argument("--lr", type=float, metavar="X", help=f"learning rate, at its highest (default: {Config.lr}, short {SHORT['lr']})")
+    training.add_argument("--seed", type=number, default=0, metavar="N",
+                          help="of the first weights, the order of pairs and the augmentation (default: 0)")
+    training.add_argument("--device", **device)
+    run = t.add_argument_group("run")
+    run.add_argument("--out", metavar="RUN", help="folder of the run (default: runs/TIME)")
+    run.add_argument("--resume", action="store_true", help="go on with the training in --out, with the options it was begun with")
+
+    network = e.add_argument_group("network")
+    network.add_argument("--weights", metavar="FILE|RUN", help="weights, or folder of a run (default: those shipped)")
+    network.add_argument("--refine", type=number, default=0, metavar="N", help=(
         "not in the paper: average both directions, and apply the network N more times to what is left (default: 0, the plain answer)"))
-    e.add_argument("--plot", action="store_true", help="draw the paths and the errors by length; needs matplotlib")
-    e.add_argument("--out", metavar="DIR", help="folder for NN.txt and results.json (default: results/TIME)")
+    network.add_argument("--device", **device)
+    results = e.add_argument_group("results")
+    results.add_argument("--out", metavar="DIR", help="folder for NN.txt and results.json (default: results/TIME)")
+    results.add_argument("--plot", action="store_true", help="draw the paths and the errors by length; needs matplotlib")
     args = vars(parser.parse_args(argv))
     keep_freed_memory()
     kitti.terminate_as_interrupted()
