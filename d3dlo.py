@@ -107,7 +107,8 @@ class Config:
         return json.loads(json.dumps(asdict(self)))
 
 
-SHORT = dict(epochs=9, batch=8, optimizer="muon", lr=1e-2, schedule="one-cycle", augment=True)      # the 10-minute training on the simulated city
+# the 10-minute training on the simulated city
+SHORT = dict(epochs=9, batch=8, optimizer="muon", lr=1e-2, schedule="one-cycle", augment=True)
 
 
 # ------------------------------------------------------------------------------------ sections 3.1, 3.2: problem and objective
@@ -237,7 +238,8 @@ GEOMETRY = 3    # raise when scan_geometry changes, so that older caches are not
 
 def scan_geometry(scan: np.ndarray, config: Config = Config()) -> np.ndarray:
     """Sampling and grouping of all three set abstractions: scan (N,4) -> record of `geometry_dtype`. FPS is nested, so one
-    sampling serves them all. Points that are not finite, beyond config.max_range or of absurd intensity are left out; ValueError when too few remain."""
+    sampling serves them all. Points that are not finite, beyond config.max_range or of absurd intensity are left out; ValueError when
+    too few remain."""
     with np.errstate(over="ignore"):
         scan = np.asarray(scan, np.float32)
     if scan.ndim != 2 or scan.shape[1] != 4:
@@ -685,7 +687,7 @@ def augment(clouds, T_pq, rng):
     when `predict_motions` refines. (2n,) records, the Ps and then the Qs, (n,4,4) -> the same, changed."""
     n = len(T_pq)
     M = np.where(rng.random((n, 1, 1)) < 0.5, np.diag([1.0, -1, 1, 1]), np.eye(4))
-    A = from_vector(rng.normal(size=(n, 6)) * [0.25, 0.1, 0.03, 0.1, 0.1, 1.0])   # sigmas in m, degrees; most yaw: turns are rare, and learned last
+    A = from_vector(rng.normal(size=(n, 6)) * [0.25, 0.1, 0.03, 0.1, 0.1, 1.0])   # m, degrees; most yaw: turns are rare, and learned last
     T_pq = M @ T_pq @ M
     A = A @ np.where(rng.random((n, 1, 1)) < 0.25, T_pq, np.eye(4))
     return moved(clouds, np.concatenate([M, A @ M])), T_pq @ invert(A)
@@ -752,24 +754,24 @@ def schedule(optimizer, config, steps):
     return torch.optim.lr_scheduler.MultiStepLR(optimizer, [steps * 3 // 5, steps * 4 // 5], gamma=0.1)
 
 
-def recompute_statistics(net, batches, objective=loss_unweighted):
-    """BatchNorm's running averages lag behind the weights; replace them by the plain mean over these batches, weights fixed.
-    Returns the mean loss over the batches in training mode."""
+def recompute_statistics(net, examples, objective=loss_unweighted):
+    """BatchNorm's running averages lag behind the weights; replace them by the plain mean over these examples (Batch,
+    target), weights fixed. Returns the mean loss over them in training mode."""
     norms = [m for m in net.modules() if isinstance(m, nn.modules.batchnorm._BatchNorm)]
     momenta = [norm.momentum for norm in norms]
     for norm in norms:
         norm.reset_running_stats()
         norm.momentum = None
-    loss = mean_loss(net.train(), batches, objective)
+    loss = mean_loss(net.train(), examples, objective)
     for norm, momentum in zip(norms, momenta):
         norm.momentum = momentum
     return loss
 
 
 @torch.no_grad()
-def mean_loss(net, batches, objective=loss_unweighted):
-    """Mean of the objective over batches, in the mode the network is in."""
-    return float(np.mean([objective(net(batch), target).item() for batch, target in batches]))
+def mean_loss(net, examples, objective=loss_unweighted):
+    """Mean of the objective over examples (Batch, target), in the mode the network is in."""
+    return float(np.mean([objective(net(batch), target).item() for batch, target in examples]))
 
 
 def save(path, **state):
@@ -830,7 +832,7 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
 
     enough = min(25, total)     # batches for the statistics, and to compare both modes on
 
-    def fixed_batches():        # drawn like those of the training
+    def fixed_batches():        # drawn like those of the training, by random numbers of their own
         return batches(geometry, motions, config, (seed, 2 ** 31), 0, enough, device)
 
     def store_checkpoint():
@@ -1092,10 +1094,12 @@ def main(argv=None):
 
     network = t.add_argument_group("network")
     network.add_argument("--weights", metavar="FILE|RUN", help="begin from these weights, with their network, and not from random ones")
-    network.add_argument("--neighbors", type=positive, metavar="N", help=f"n_n of the first set abstraction, Table 2 (default: {Config.sa1.n_n})")
+    network.add_argument("--neighbors", type=positive, metavar="N",
+                         help=f"n_n of the first set abstraction, Table 2 (default: {Config.sa1.n_n})")
     network.add_argument("--no-plane", action="store_false", dest="plane", help="leave out the points of the ground plane, Table 2")
     training = t.add_argument_group("training")
-    training.add_argument("--short", action="store_true", help="fewer epochs, one-cycle learning rate, Muon, augmentation (always without --data)")
+    training.add_argument("--short", action="store_true",
+                          help="fewer epochs, one-cycle learning rate, Muon, augmentation (always without --data)")
     training.add_argument("--epochs", type=positive, metavar="N", help=f"default: {Config.epochs}, short {SHORT['epochs']}")
     training.add_argument("--batch", type=positive, metavar="N",
                           help=f"pairs in a batch, each both ways (default: {Config.batch}, short {SHORT['batch']})")
@@ -1127,8 +1131,9 @@ def main(argv=None):
             if args["weights"] and (args["neighbors"] or not args["plane"]):
                 raise ValueError("--weights brings its network along; leave out --neighbors and --no-plane")
             config = Config(**(SHORT if args.pop("short") or not args["data"] else {}), plane=args.pop("plane"))
-            n_n, given = args.pop("neighbors"), {name: args.pop(name) for name in ("epochs", "batch", "lr")}
-            train(replace(config, **{name: x for name, x in given.items() if x is not None}, sa1=config.sa1._replace(n_n=n_n or config.sa1.n_n)), **args)
+            given = {name: args.pop(name) for name in ("epochs", "batch", "lr")}
+            given = {name: x for name, x in given.items() if x is not None}
+            train(replace(config, **given, sa1=config.sa1._replace(n_n=args.pop("neighbors") or config.sa1.n_n)), **args)
     except KeyboardInterrupt as interruption:
         print(f"\nd3dlo: interrupted; {str(interruption) or 'run it again; a training goes on by train --out RUN --resume'}", file=sys.stderr)
         return 130
