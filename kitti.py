@@ -692,7 +692,7 @@ def _missing(root, names, seed, scans, azimuth):
     return jobs
 
 
-def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range(11)), scans=None, azimuth=2083, workers=None) -> Path:
+def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range(11)), scans=None, azimuth=1800, workers=None) -> Path:
     """Drives an HDL-64E through one simulated city per sequence and writes ROOT in KITTI's odometry layout with exact ground truth -> ROOT.
 
     sequences: names, splits or 'all'; scans: number per sequence (None: 320 for the training split, else 170; tests drive more than 115 m);
