@@ -1,7 +1,7 @@
 """D3DLO: Deep 3D LiDAR Odometry (Adis, Horst, Wien; ICIP 2021)
 
-Sections 3 to 6 in the paper's order, but for sampling and grouping (3.3.2, 3.3.3), which come before the layers that use them, and after the
-network what the paper tried and left (3.2, 3.4) and odometry (eq. 1).
+In the paper's order: Table 1; problem and objective (3.1, 3.2); the network (3.3), sampling and grouping (3.3.2, 3.3.3) before the layers
+that use them; what the paper tried and left (3.2, 3.4); poses from scans (eq. 1); training (4); evaluation (5).
 
 Two LiDAR scans in, the motion between them out: set abstraction on each scan, a flow embedding between them, two more set
 abstractions, a mini-PointNet, an MLP; 61,290 parameters. Sampling and grouping depend on no weight, so they are NumPy: those
@@ -48,7 +48,7 @@ class Layer(NamedTuple):
     r: float | None         # radius of the ball [m]
     n_fps: int | None       # centroids kept by farthest point sampling
     n_n: int | None         # neighbours of a centroid
-    mlp: tuple              # output widths of the MLP
+    mlp: tuple              # output widths of its layers: four in sa1, and not from 4 to 8 to 16 to 32. Only so are there 61,290 parameters
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ class Config:
     mpn: Layer = Layer(None, None, None, (64, 256))
     mlp: Layer = Layer(None, None, None, (64, 6))
 
-    spread: int = 1             # which n_n of a ball: the nearest, or in even steps of the nearest spread * n_n
-    max_range: float = 50.0     # m; ours: what is further is left out. 1,024 points spread over 80 m lie too far apart for Table 1's balls
+    spread: int = 1             # ours: which n_n of a ball: the nearest, or in even steps of the nearest spread * n_n
+    max_range: float = 50.0     # m; ours: what is further is left out. Spread over 80 m, 1,024 centroids lie too far apart for Table 1's balls
     plane: bool = True          # keep the points of the ground plane, Table 2's "pp"
     epochs: int = 500           # section 4
     batch: int = 16             # pairs; ours
@@ -159,7 +159,7 @@ def _side_by_side(xyz):
 
 
 def farthest_point_sampling(xyz: np.ndarray, n: int, start: int = 0) -> np.ndarray:
-    """Exact farthest point sampling: (N,3) -> (n,) int64 indices. Each pick is the point farthest from all picks before it.
+    """Exact farthest point sampling: (N,3), finite -> (n,) int64 indices. Each pick is the point farthest from all picks before it.
 
     Ties go to the lowest index (so picks repeat when fewer than n points differ). Nested: the first m picks are what n = m gives.
     The cloud is cut into chunks of neighbours. A pick can shorten distances only in chunks whose bounding box is nearer to it than
@@ -199,7 +199,7 @@ def group_ball(xyz: np.ndarray, centroids: np.ndarray, r: float, n_n: int, tree:
     included: the nearest n_n, or with spread > 1 n_n in even steps, from first to last, of the nearest spread * n_n.
 
     The first is the centroid (or a point in the same place). Where there are fewer, the missing slots hold the centroid's own
-    index (section 3.3.2). That changes no maximum, though it counts in BatchNorm's statistics, and it is common: on real scans
+    index (section 3.3.2, of an empty ball). That changes no maximum, though it counts in BatchNorm's statistics, and it is common: on real scans
     19 to 37 % of SA1's balls have fewer than 8 points. `tree`, a cKDTree of xyz, saves building one.
     """
     # ranks as a list: for the number 1 scipy would drop the axis
@@ -228,7 +228,7 @@ def geometry_dtype(config):
                      ("group", "f4", (n1, k1, 4)),      # their neighbours, scale by scale: offset [m] and intensity
                      ("idx2", "u2", (n2, k2)),          # of SA2's centroids: neighbours among SA1's
                      ("idx3", "u2", (n3, k3)),          # of SA3's: among SA2's
-                     ("dropped", "i4"),                 # NaN or infinite points left out
+                     ("dropped", "i4"),                 # points left out that no sensor gives: not finite, or of absurd intensity
                      ("looks", "f4", len(LOOKS)),
                      ("crc", "u4")])                    # of all the bytes before
 
@@ -342,7 +342,7 @@ def load_geometry(sequences, config, cache="cache"):
     geometry = [np.load(file, mmap_mode="r") if records is None else records for file, records in zip(files, geometry)]
     for s, records in zip(sequences, geometry):
         if records["dropped"].any():
-            print(f"sequence {s.name}: left out {records['dropped'].sum()} NaN or infinite points in "
+            print(f"sequence {s.name}: left out {records['dropped'].sum()} points that are not finite in "
                   f"{np.count_nonzero(records['dropped'])} of {len(s)} scans", file=sys.stderr)
     return geometry
 
@@ -479,7 +479,8 @@ class SetAbstraction(nn.Module):
     """Section 3.3.2, eq. 3: f'_j = max_i h_sa(f_i, x_i - x'_j) over the neighbours i of centroid j.
 
     The first linear layer acts on a concatenation, so it is applied to each point before gathering, W [x_i - x'_j, f_i] + b =
-    (W_x x_i + W_f f_i) + (b - W_x x'_j): the same parameters and function at a fraction of the memory traffic.
+    (W_x x_i + W_f f_i) + (b - W_x x'_j): the same parameters and function at a fraction of the memory traffic. (The order, x before f, is
+    ours. SA1's neighbours come gathered from the cache, so of it only `h` is called.)
     """
 
     def __init__(self, d_in, layer):
@@ -495,8 +496,8 @@ class SetAbstraction(nn.Module):
 
 
 class FlowEmbedding(nn.Module):
-    """Section 3.3.3, eq. 4: e_i = max_j h_fe(f_i, g_j, y_j - x_i) over the neighbours j in Q of point i of P. The first linear
-    layer is split as in SetAbstraction."""
+    """Section 3.3.3, eq. 4: e_i = max_j h_fe(f_i, g_j, y_j - x_i) over the neighbours j in Q of point i of P: the k nearest, as the
+    section ends, not a ball. The first linear layer is split as in SetAbstraction."""
 
     def __init__(self, d_in, layer):
         super().__init__()
@@ -529,7 +530,7 @@ class D3DLO(nn.Module):
         """Batch -> (B,6): [tx, ty, tz] m and [roll, pitch, yaw] degrees of T_pq (section 3.2), extrinsic x-y-z (ours). With Config's
         quaternion (B,7), see `from_output`."""
         p, q, (n2, n3) = batch.p, batch.q, (batch.idx2.shape[1], batch.idx3.shape[1])
-        feat = self.sa1.h(batch.group[:, :, :self.config.sa1.n_n])                             # (C,1024,32), eq. 3; the neighbours come gathered
+        feat = self.sa1.h(batch.group[:, :, :self.config.sa1.n_n])                             # (C,1024,32), eq. 3; neighbours come gathered
         if self.scales:
             rest = batch.group[:, :, self.config.sa1.n_n:].split([scale.n_n for scale in self.config.scales], 2)
             feat = torch.cat([feat, *(sa.h(group) for sa, group in zip(self.scales, rest))], 2)
@@ -548,7 +549,8 @@ class D3DLO(nn.Module):
 # ------------------------------------------------------------- sections 3.4, 3.2: what the paper tried beside eq. 2, off by default
 
 def cosine_distance(y_hat, y):
-    """Eq. 5, the mean over a batch: (B,D), (B,D) -> (). The small number gives standing still a value (1) and a gradient."""
+    """Eq. 5, the mean over a batch: (B,D), (B,D) -> (). The small number gives standing still the value 1, not NaN, and tells for motions
+    of millimetres."""
     return (1 - (y * y_hat).sum(1) * torch.rsqrt((y.square().sum(1) + 1e-6) * (y_hat.square().sum(1) + 1e-6))).mean()
 
 
@@ -594,7 +596,8 @@ def load_weights(path: str | Path | None = None, device: str = "cpu") -> tuple[D
         net = D3DLO(Config(**state["config"]))
         net.load_state_dict(state["model"])
         state["step"], state["train"].values()          # all must be there
-        np.reshape(state["mean_motion"], 6), np.reshape(state["seen"], (2, len(LOOKS)))
+        if np.shape(state["mean_motion"]) != (6,) or np.shape(state["seen"]) != (2, len(LOOKS)):
+            raise ValueError("damaged")
     except Exception as error:      # torch and pickle raise many kinds; to the user they are one
         reason = f"{type(error).__name__}: {error}".splitlines()[-1].strip()
         raise ValueError(f"{path}: no weights of D3DLO ({reason:.120}); give a weights.pt or a run folder") from None
@@ -657,11 +660,11 @@ class Odometry:
 
     def register(self, scan: np.ndarray) -> np.ndarray:
         """(N,4) float32 x, y, z [m], intensity 0..1 -> pose (4,4) float64 T_{0,t} of this scan in the first one's Velodyne frame,
-        the identity for the first. The motion depends on the last two scans alone. NaN or infinite points are left out with a
+        the identity for the first. The motion depends on the last two scans alone. Points that are not finite are left out with a
         warning; ValueError for a scan that is refused, which changes nothing."""
         record = scan_geometry(scan, self.net.config)
         if record["dropped"]:
-            warnings.warn(f"left out {record['dropped']} NaN or infinite points", stacklevel=2)
+            warnings.warn(f"left out {record['dropped']} points that are not finite", stacklevel=2)
         if self.seen and (strange := unlike(record["looks"], self.seen)):
             warnings.warn(f"a scan unlike those the weights were trained on, do not trust the answer: {strange}", stacklevel=2)
             self.seen = None                            # said once
@@ -751,7 +754,7 @@ def schedule(optimizer, config, steps):
     """The learning rate over all steps: the paper's decay at 300 and 400 of 500 epochs, in proportion, or torch's one cycle."""
     if config.schedule == "one-cycle":
         return torch.optim.lr_scheduler.OneCycleLR(optimizer, config.lr, total_steps=steps)
-    return torch.optim.lr_scheduler.MultiStepLR(optimizer, [steps * 3 // 5, steps * 4 // 5], gamma=0.1)
+    return torch.optim.lr_scheduler.MultiStepLR(optimizer, [max(1, steps * 3 // 5), max(1, steps * 4 // 5)], gamma=0.1)
 
 
 def recompute_statistics(net, examples, objective=loss_unweighted):
@@ -802,7 +805,7 @@ def interruption_waits():
 
 
 def training_step(objective, net, batch, target, minimizers):
-    """Loss of a batch, after which the optimisers and their schedules go one step on. Returns it, and the learning rate."""
+    """Loss of a batch, after which `minimizers`, the optimisers and their schedules, go one step on. Returns it, and the learning rate."""
     loss, rate = objective(net.train()(batch), target), minimizers[0].param_groups[0]["lr"]
     net.zero_grad()
     objective.zero_grad()
@@ -870,7 +873,7 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
     return usable
 
 
-# ----------------------------------------------------------------------------------------------- sections 5 and 6: evaluation
+# ------------------------------------------------------------------------------------------------------ section 5: evaluation
 
 PREDICTORS = "network", "standing still", "mean motion of training"        # the last two show what little is worth
 
@@ -921,8 +924,7 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu",
     each = {name: summary([name]) for name in errors}
     pooled = {part: {p: summary(names, p) for p in PREDICTORS} for part, names in parts.items() if names}
     lengths = metrics.by_length([e["network"][0] for e in errors.values() if e])
-    results = {**source, "sequences": each, "lengths": lengths, "splits": {part: p["network"] for part, p in pooled.items() if part != "all"},
-               "pooled": pooled["all"]["network"], "predictors": {p: {part: s[p] for part, s in pooled.items()} for p in PREDICTORS[1:]}}
+    results = {**source, "sequences": each, "pooled": pooled, "lengths": lengths}
     plain = json.loads(json.dumps(results), parse_constant=lambda nan: None)    # JSON has no NaN
     with metrics.replacing(out / "results.json") as temporary:
         temporary.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
@@ -938,6 +940,16 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu",
 
 
 # ------------------------------------------------------------------------------------------------------------- command line
+
+def data_root(data, asked=(), made=None):
+    """The folder `data`, or if None that of the simulated city, of which the sequences `made` (None: all) are made where missing. ValueError
+    when one asked for is none of its."""
+    if data:
+        return Path(data)
+    if strange := set(asked) - {"all", *SPLITS, *sum(SPLITS.values(), ())}:
+        raise ValueError(f"the simulated city has no sequence {' '.join(sorted(strange))}: there are 00 to 10, the splits {', '.join(SPLITS)}, and all")
+    return kitti.simulate(SIMULATED, **({"sequences": made} if made else {}))
+
 
 def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu", resume=False, weights=None):
     """The command `train`: train on `sequences` of `data` (None: the simulated city) as `config` says (None: the paper's, or the short
@@ -955,7 +967,7 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     if weights:
         first, before = load_weights(weights)
         config = replace(first.config, **{name: getattr(config, name) for name in SHORT})
-    root = Path(data) if data else kitti.simulate(SIMULATED)
+    root = data_root(data, sequences or ())
     there = [s.name for s in kitti.open_sequences(root)]
     chosen = kitti.open_sequences(root, sequences or ("train" if set(SPLITS["train"]) & set(there) else "all"))
     names, motions = [s.name for s in chosen], [s.motions() for s in chosen]
@@ -997,10 +1009,11 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     validation sequences). Returns the folder with trajectories and figures. ValueError, FileNotFoundError."""
     check_device(device)
     net, state = load_weights(weights, device)
+    if plot:
+        metrics.picture(1, 1)                                   # say so now if it cannot be drawn, not after the work
     out = Path(out or time.strftime("results/%Y-%m-%d-%H%M%S"))
     sequences = sequences or ("all" if data else ("test", "validation"))
-    known = {"all", *SPLITS, *sum(SPLITS.values(), ())}         # of a misspelt name no city is made
-    root = Path(data) if data else kitti.simulate(SIMULATED, sequences=[name for name in sequences if name in known])
+    root = data_root(data, sequences, None if "all" in sequences else sequences)
     chosen = kitti.open_sequences(root, sequences)
     for s in chosen:
         if s.poses is None and (s.folder / "poses.txt").exists():

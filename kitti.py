@@ -114,8 +114,8 @@ def _check_name(name):
 
 
 class Sequence:
-    """One sequence of ROOT in KITTI's layout, checked before anything is used: ROOT/sequences/NAME/{velodyne/000000.bin ..., calib.txt,
-    times.txt} and, where there is ground truth, ROOT/poses/NAME.txt.
+    """One sequence of ROOT in KITTI's layout, checked before anything is used: ROOT/sequences/NAME/{velodyne/000000.bin ..., calib.txt}
+    and, where there is ground truth, ROOT/poses/NAME.txt.
 
     name, scan_paths (list of n paths), Tr (4,4) = T_cam0_velo, poses_cam (n,4,4) as in the file or None, poses (n,4,4) = T_0t in the
     Velodyne frame or None. Raises FileNotFoundError or ValueError when anything is missing or does not fit together."""
@@ -199,7 +199,7 @@ def remove_plane(scan: np.ndarray, threshold=0.15, max_tilt=15.0, hypotheses=400
     """A scan (N,3+) -> the scan without the points nearer than `threshold` [m] to its dominant near-horizontal plane (RANSAC; paper 4), order kept.
 
     Planes through three random points whose normal is within `max_tilt` degrees of vertical are scored all at once on a random subsample;
-    the best is fitted again, twice, to all its inliers. Returned unchanged when no hypothesis qualifies. Non-finite points are kept."""
+    the best is fitted again, twice, to all its inliers. Returned unchanged when no plane qualifies. Non-finite points are kept."""
     rng = np.random.default_rng(seed)
     xyz = np.ascontiguousarray(scan[:, :3], dtype=np.float32)  # (N,3)
     good = np.flatnonzero(np.isfinite(xyz).all(axis=1))
@@ -229,7 +229,7 @@ def remove_plane(scan: np.ndarray, threshold=0.15, max_tilt=15.0, hypotheses=400
         centred = inlier - mean.astype(np.float32)
         n = np.linalg.eigh((centred.T @ centred).astype(float))[1][:, 0]  # least squares: the direction of least spread
         d = n @ mean
-    return scan[~near(n, d)]
+    return scan if abs(n[2]) < np.cos(np.radians(max_tilt)) else scan[~near(n, d)]  # a wall alone is no ground
 
 
 # ---------------------------------------------------------------------------------------------------- the simulated city

@@ -110,7 +110,7 @@ def segment_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
 
     (n,4,4), (n,4,4) -> structured array with fields first, last (frames), length [m], t_err [%], r_err [deg/m].
     A segment starts at every 10th frame and ends at the first frame whose path from there is strictly longer than 100, 200,
-    ... 800 m of true path; errors are divided by that nominal length. The devkit sums the path in float32, which may move
+    ... 800 m of true path; errors are divided by that nominal length, not by the straight distance that eqs. 7 and 8 name. The devkit sums the path in float32, which may move
     `last` by a frame; here it is float64. ValueError when the lengths differ.
     """
     T_gt, T_est = _same_length(T_gt, T_est)
@@ -121,7 +121,7 @@ def segment_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
     delta_gt = np.linalg.inv(T_gt[first]) @ T_gt[last]
     delta_est = np.linalg.inv(T_est[first]) @ T_est[last]
     error = np.linalg.inv(delta_est) @ delta_gt     # (segments,4,4); the inverse of the paper's, as in the devkit: same length and angle
-    cosine = (np.trace(error[:, :3, :3], axis1=1, axis2=2) - 1) / 2                 # eq. 6, as the devkit has it; _angle is for steps
+    cosine = (np.trace(error[:, :3, :3], axis1=1, axis2=2) - 1) / 2                 # eq. 6, by the arccos for the devkit's digits; _angle is for steps
     out = np.empty(len(first), SEGMENT)
     out["first"], out["last"], out["length"] = first, last, length
     out["t_err"] = 100 * np.linalg.norm(error[:, :3, 3], axis=1) / length
@@ -183,14 +183,19 @@ def row(name, s):
     return [name, s["segments"], f"{s['E_t']:.3f}", f"{s['E_r']:.5f}", f"{s['t_step_m']:.4f}", f"{s['r_step_deg']:.4f}"]
 
 
-def draw(path, trajectories):
-    """{name: (T_gt or None, T_est)} in KITTI's camera frame -> a PNG, for each name a row: the path from above, and KITTI's errors by the
-    length of the segments. ValueError without matplotlib."""
+def picture(width, height):
+    """An empty figure of so many inches. ValueError without matplotlib."""
     try:
         from matplotlib.figure import Figure                # without pyplot no display is needed
     except ImportError:
         raise ValueError("a picture needs matplotlib: pip install \".[plot]\"") from None
-    figure = Figure(figsize=(10.5, 3.1 * len(trajectories)), layout="constrained")
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def draw(path, trajectories):
+    """{name: (T_gt or None, T_est)} in KITTI's camera frame -> a PNG, for each name a row: the path from above, and KITTI's errors by the
+    length of the segments. ValueError without matplotlib."""
+    figure = picture(10.5, 3.1 * len(trajectories))
     rows = figure.subplots(len(trajectories), 3, squeeze=False)
     for (name, (T_gt, T_est)), (above, *errors) in zip(trajectories.items(), rows):
         for T, style in (T_gt, dict(color="0.65", lw=4, label="truth")), (T_est, dict(color="black", lw=1.2, label="estimate")):
@@ -232,6 +237,8 @@ def main(argv=None):
     args = parser.parse_args(argv)
     rows, all_segments, all_steps, trajectories = [], [], [], {}
     try:
+        if args.plot:
+            picture(1, 1)                                   # say so now if it cannot be drawn
         for name, files in _pairs_of_files(args.gt, args.est).items():
             T_gt, T_est = map(read_poses, files)
             if len(T_gt) != len(T_est):

@@ -675,10 +675,10 @@ def test_remove_plane_takes_the_ground_and_leaves_the_box(seed, roll, pitch):
     assert_array_equal(kitti.remove_plane(scan, seed=seed), left)
 
 
-@pytest.mark.parametrize("N", [0, 2, 500])
-def test_remove_plane_without_a_plane_changes_nothing(N):
+@pytest.mark.parametrize("N, thick", [(0, 0), (2, 0), (500, 0), (5000, 0.1)])
+def test_remove_plane_without_a_plane_changes_nothing(N, thick):
     rng = generator(0)
-    wall = np.c_[np.zeros(N), rng.uniform(-9, 9, N), rng.uniform(-2, 9, N), rng.random(N)].astype(np.float32)
+    wall = np.c_[rng.normal(size=N) * thick, rng.uniform(-9, 9, N), rng.uniform(-2, 9, N), rng.random(N)].astype(np.float32)
     assert_array_equal(kitti.remove_plane(wall), wall)
 
 
@@ -992,8 +992,8 @@ def test_eval_writes_what_it_prints_and_metrics_agrees(here, weights, capsys):
     out, err = capsys.readouterr()
     results, (net, _) = json.loads((here / "out" / "results.json").read_text()), load_weights(weights)
     assert complaint(err) == [] and sorted(os.listdir("out")) == ["03.txt", "07.txt", "11.txt", "results.json"]
-    assert list(results["sequences"]) == ["03", "07", "11"] and set(results["splits"]) == {"test", "validation"}
-    for name, s in [*results["sequences"].items(), ("all", results["pooled"])]:
+    assert list(results["sequences"]) == ["03", "07", "11"] and set(results["pooled"]) == {"test", "validation", "all"}
+    for name, s in [*results["sequences"].items(), ("all", results["pooled"]["all"]["network"])]:
         assert figures(out, name) == as_printed(s) and s["trained_on"] is False
     assert results["sequences"]["11"]["E_t"] is None and len(metrics.read_poses("out/11.txt")) == 20
     for s in kitti.open_sequences(root, ["03", "07"]):  # once more, from the files
@@ -1003,7 +1003,7 @@ def test_eval_writes_what_it_prints_and_metrics_agrees(here, weights, capsys):
         assert_allclose([got["E_t"], got["E_r"], got["t_step_m"], got["r_step_deg"]], [*segments[-1].mean(0), *steps], rtol=1e-5)
         expected = d3dlo.accumulate([from_vector(predict(net, s.scan(i), s.scan(i + 1))) for i in range(19)])
         assert_allclose(kitti.camera_to_velo(T, s.Tr), expected, rtol=1e-3, atol=1e-3)
-    assert_allclose([results["pooled"][key] for key in ("E_t", "E_r")], np.concatenate(segments).mean(0), rtol=1e-5)
+    assert_allclose([results["pooled"]["all"]["network"][key] for key in ("E_t", "E_r")], np.concatenate(segments).mean(0), rtol=1e-5)
     assert metrics.main(["root/poses", "out"]) == 0     # in the camera's frame: the same segments, other steps
     out = capsys.readouterr().out
     assert all(figures(out, name)[:3] == as_printed(results["sequences"][name])[:3] for name in ("03", "07"))
@@ -1102,6 +1102,12 @@ def test_bad_arguments_are_named_in_one_line(here, weights, capsys, arguments, w
     extra += ["--weights", weights] * (arguments[0] == "eval" and "--weights" not in arguments)
     fails_with_one_line(d3dlo.main, arguments + extra, words, capsys)
     assert files_of(here) == before
+
+
+def test_no_city_is_made_of_a_misspelt_name(here, weights, capsys):
+    fails_with_one_line(d3dlo.main, ["eval", "--weights", weights, "--sequences", "0O"], "0O", capsys)
+    fails_with_one_line(d3dlo.main, ["train", "--sequences", "00", "0O"], "0O", capsys)
+    assert not any(here.iterdir())
 
 
 class Mischief:

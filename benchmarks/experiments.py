@@ -80,8 +80,7 @@ def config_of(changes, pairs, budget):
 
 def folder_of(out, config, seed, chosen, everything):
     """Where a run lies: named by all it depends on, the data included."""
-    changes = {name: value for name, value in config.as_dict().items() if value != Config().as_dict()[name]}
-    depends = changes, seed, d3dlo.GEOMETRY, [s.name for s in chosen], [d3dlo.fingerprint(s) for s in everything]
+    depends = config.as_dict(), seed, d3dlo.GEOMETRY, [s.name for s in chosen], [d3dlo.fingerprint(s) for s in everything]
     return out / hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()[:12]
 
 
@@ -125,7 +124,7 @@ def child(run, config, root, sequences, evaluated, seed):
 def figures(run, split):
     """E_t, E_r, t step, r step of a run on a split."""
     results = json.loads((run / "all" / "results.json").read_text())
-    result = results["pooled"] if split == "all" else results["splits"][split]
+    result = results["pooled"][split]["network"]
     return [result[key] if result[key] is not None else math.nan for key in ("E_t", "E_r", "t_step_m", "r_step_deg")]
 
 

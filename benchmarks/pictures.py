@@ -81,7 +81,7 @@ def budget(runs):
     points = []
     for run in runs:
         state = torch.load(run / "weights.pt", weights_only=True)
-        config, results = d3dlo.Config(**state["config"]), json.loads((run / "results" / "results.json").read_text())["pooled"]
+        config, results = d3dlo.Config(**state["config"]), json.loads((run / "results" / "results.json").read_text())["pooled"]["test"]["network"]
         points.append((state["step"] * config.batch * (2 if config.swap == "both" else 1), results["E_t"], results["t_step_m"], results["r_step_deg"]))
     steps, *errors = np.array(sorted(points)).T
     figure = Figure(figsize=(10, 3), layout="constrained")
