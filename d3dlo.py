@@ -200,7 +200,7 @@ def group_ball(xyz: np.ndarray, centroids: np.ndarray, r: float, n_n: int, tree:
 
     The first is the centroid (or a point in the same place). Where there are fewer, the missing slots hold the centroid's own
     index (section 3.3.2, of an empty ball). That changes no maximum, though it counts in BatchNorm's statistics, and it is common: on real scans
-    19 to 37 % of SA1's balls have fewer than 8 points. `tree`, a cKDTree of xyz, saves building one.
+    10 to 18 % of SA1's balls have fewer than 8 points. `tree`, a cKDTree of xyz, saves building one.
     """
     # ranks as a list: for the number 1 scipy would drop the axis
     _, idx = (tree or cKDTree(xyz)).query(xyz[centroids], [*range(1, spread * n_n + 1)], distance_upper_bound=np.nextafter(r, np.inf))
@@ -963,8 +963,9 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     if resume:
         config, data, sequences, seed, weights = begun_with(run)
     data, weights = (path and str(Path(path).resolve()) for path in (data, weights))
-    before = {"train": {}, "seen": []}
-    if weights:
+    checkpoint, before = run / "checkpoint.pt", {"train": {}, "seen": []}
+    state = load_weights(checkpoint, device)[1] if resume and checkpoint.exists() else None
+    if weights and not state:
         first, before = load_weights(weights)
         config = replace(first.config, **{name: getattr(config, name) for name in SHORT})
     root = data_root(data, sequences or ())
@@ -974,14 +975,18 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     if not sum(map(len, motions)):
         raise ValueError(f"{root}: sequence {' '.join(names)} has a single scan; training needs pairs")
     held_out = kitti.open_sequences(root, [n for n in SPLITS["test"] + SPLITS["validation"] if n in there and n not in names])
-    remember = {"train": {f"{name}, before": digest for name, digest in before["train"].items()} | {s.name: fingerprint(s) for s in chosen},
-                "mean_motion": to_vector(np.concatenate(motions)).mean(0).tolist()}
-    state = load_weights(run / "checkpoint.pt", device)[1] if resume and (run / "checkpoint.pt").exists() else None
-    if state and state["train"] != remember["train"]:
-        raise ValueError(f"{run}/checkpoint.pt: was trained on other data than lies there now; resume with the data it was begun with")
+    digests = {s.name: fingerprint(s) for s in chosen}
+    if state and "losses" not in state:
+        raise ValueError(f"{checkpoint}: holds weights, but no training to go on with")
+    if state and not digests.items() <= state["train"].items():
+        raise ValueError(f"{checkpoint}: was trained on other data than lies there now; resume with the data it was begun with")
     geometry = load_geometry(chosen + held_out, config)
-    looks = np.concatenate([*(records["looks"] for records in geometry[:len(chosen)]), np.reshape(before["seen"], (-1, len(LOOKS)))])
-    remember["seen"] = [looks.min(0).tolist(), looks.max(0).tolist()]
+    if state:
+        remember = {name: state[name] for name in ("train", "mean_motion", "seen")}
+    else:
+        looks = np.concatenate([*(records["looks"] for records in geometry[:len(chosen)]), np.reshape(before["seen"], (-1, len(LOOKS)))])
+        remember = {"train": {f"{name}, before": digest for name, digest in before["train"].items()} | digests,
+                    "mean_motion": to_vector(np.concatenate(motions)).mean(0).tolist(), "seen": [looks.min(0).tolist(), looks.max(0).tolist()]}
 
     note_beginning(run, dict(data=data, sequences=names, seed=seed, device=device, weights=weights), config, remember["train"])
 
@@ -992,7 +997,7 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
 
     torch.manual_seed(seed)
     net = D3DLO(config).to(device)
-    if weights:
+    if weights and not state:
         net.load_state_dict(first.state_dict())
     say(f"{sum(p.numel() for p in net.parameters()):,} parameters, {sum(map(len, motions)):,} pairs of scans, {config.epochs} epochs of "
         f"{steps_per_epoch(motions, config)} batches -> {run}")

@@ -1038,6 +1038,8 @@ def test_train_then_eval_then_train_again(here, city, capsys):
     (here / "run" / "config.json").write_text(json.dumps(begun))
     fails_with_one_line(d3dlo.main, ["train", "--out", "run", "--resume"], "other data", capsys)
     assert (here / "run" / "checkpoint.pt").read_bytes() == before
+    shutil.copy("run/weights.pt", "run/checkpoint.pt")
+    fails_with_one_line(d3dlo.main, ["train", "--out", "run", "--resume"], "no training", capsys)
 
 
 def test_a_training_from_weights_begins_with_them_and_remembers_what_they_saw(here):
@@ -1051,6 +1053,9 @@ def test_a_training_from_weights_begins_with_them_and_remembers_what_they_saw(he
     assert set(seen_a["train"].values()) < set(seen_b["train"].values()) and len(seen_b["train"]) == 2
     (low_a, high_a), (low_b, high_b) = seen_a["seen"], seen_b["seen"]
     assert np.all(np.array(low_b) <= low_a) and np.all(np.array(high_b) >= high_a)
+    shutil.rmtree("a")
+    d3dlo.train(out="b", resume=True)                   # for which they are not needed any more
+    assert load_weights("b")[1]["train"] == seen_b["train"]
     d3dlo.evaluate("first", "b", out="results")
     assert json.loads((here / "results" / "results.json").read_text())["sequences"]["00"]["trained_on"]
 

@@ -7,6 +7,7 @@ For each sequence, over 8 scans spread evenly: usable points, mean intensity, sh
 centroids more than 0.5 m above the road. Then of these, by range: how thick the surface is within 1 m (smallest standard deviation, median),
 how round (smallest over largest, mean), and how far the nearest point of the next scan lies once the true motion is undone (median).
 """
+import argparse
 import sys
 from pathlib import Path
 
@@ -36,11 +37,14 @@ def of_pair(P, Q, T_pq, config):
 
 def main():
     """The command line."""
-    if len(sys.argv) < 2:
-        sys.exit(__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("root", metavar="ROOT")
+    parser.add_argument("names", nargs="*", metavar="NN")
+    args = parser.parse_args()
     config = d3dlo.Config()
-    print(f"{'sequence':<12}points  intensity  ground  raised   " + "   ".join(f"{a} to {b} m: thick round next" for a, b in zip(EDGES, EDGES[1:])))
-    for s in kitti.open_sequences(sys.argv[1], sys.argv[2:] or "all"):
+    print(f"{'sequence':<12}points  intensity  ground  raised   "
+          + "   ".join(f"{a:2d} to {b} m: thick round next" for a, b in zip(EDGES, EDGES[1:])))
+    for s in kitti.open_sequences(args.root, args.names or "all"):
         if s.poses is None:
             sys.exit(f"{s.folder}: needs ground truth, poses/{s.name}.txt")
         motions = s.motions()
@@ -49,7 +53,7 @@ def main():
         line = f"{s.name:<12}{points:6.0f}  {intensity:9.2f}  {ground:6.2f}  {np.mean(raised):6.2f}   "
         for a, b in zip(EDGES, EDGES[1:]):
             some = rows[(rows[:, 0] > a) & (rows[:, 0] <= b)]
-            line += f"{np.nanmedian(some[:, 1]):17.3f} {np.nanmean(some[:, 2]):5.2f} {np.median(some[:, 3]):4.2f}   "
+            line += f"{np.nanmedian(some[:, 1]):18.3f} {np.nanmean(some[:, 2]):5.2f} {np.median(some[:, 3]):4.2f}   "
         print(line, flush=True)
 
 
