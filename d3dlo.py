@@ -253,7 +253,7 @@ def scan_geometry(scan: np.ndarray, config: Config = Config()) -> np.ndarray:
     n1, (r2, n2, k2, _), (r3, n3, k3, _) = config.sa1.n_fps, config.sa2, config.sa3
     if len(scan) < n1:
         usable = f"finite, nearer than {config.max_range:.0f} m, intensity below 65,536" + ("" if config.plane else ", off the ground")
-        raise ValueError(f"{len(scan)} usable points ({usable}), at least {n1} are needed")
+        raise ValueError(f"{len(scan)} usable points ({usable}), at least {n1} are needed; are the coordinates in metres?")
     cloud = np.ascontiguousarray(scan[:, :3])
     with ThreadPoolExecutor(1) as aside:
         tree = aside.submit(cKDTree, cloud, leafsize=48, balanced_tree=False, compact_nodes=False)     # quicker to build, as good to ask
@@ -588,7 +588,7 @@ def load_weights(path: str | Path | None = None, device: str = "cpu") -> tuple[D
     path = Path(path or WEIGHTS)
     path = path / "weights.pt" if path.is_dir() else path
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; `python d3dlo.py train` makes weights, --weights names them")
+        raise FileNotFoundError(f"{path}: no such file; give a weights.pt or the folder of a run, as `python d3dlo.py train` makes them")
     try:
         if zipfile.ZipFile(path).testzip():             # torch does not look at the checksums
             raise ValueError("damaged")
@@ -674,10 +674,10 @@ class Odometry:
         return self.pose.copy()
 
 
-def relative_pose(scan_p: np.ndarray, scan_q: np.ndarray, weights: str | Path | None = None) -> np.ndarray:
+def relative_pose(scan_p: np.ndarray, scan_q: np.ndarray, weights: str | Path | None = None, refine: int = 0) -> np.ndarray:
     """Two scans (N,4) -> T_pq (4,4) float64, which maps points of Q into P's frame (section 3.1). As in `Odometry`, which serves
     better for many pairs: the weights are loaded at each call."""
-    odometry = Odometry(weights)
+    odometry = Odometry(weights, refine=refine)
     odometry.register(scan_p)
     return odometry.register(scan_q)
 
@@ -970,7 +970,10 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
         config = replace(first.config, **{name: getattr(config, name) for name in SHORT})
     root = data_root(data, sequences or ())
     there = [s.name for s in kitti.open_sequences(root)]
-    chosen = kitti.open_sequences(root, sequences or ("train" if set(SPLITS["train"]) & set(there) else "all"))
+    ours = [n for n in SPLITS["train"] if n in there] or [n for n in there if n not in SPLITS["test"] + SPLITS["validation"]]
+    if not (sequences or ours):
+        raise ValueError(f"{root}: holds only sequences of the test and validation splits, {' '.join(there)}; --sequences names those to train on")
+    chosen = kitti.open_sequences(root, sequences or ours)
     names, motions = [s.name for s in chosen], [s.motions() for s in chosen]
     if not sum(map(len, motions)):
         raise ValueError(f"{root}: sequence {' '.join(names)} has a single scan; training needs pairs")
@@ -999,8 +1002,10 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     net = D3DLO(config).to(device)
     if weights and not state:
         net.load_state_dict(first.state_dict())
-    say(f"{sum(p.numel() for p in net.parameters()):,} parameters, {sum(map(len, motions)):,} pairs of scans, {config.epochs} epochs of "
-        f"{steps_per_epoch(motions, config)} batches -> {run}")
+    say(f"{sum(p.numel() for p in net.parameters()):,} parameters, {sum(map(len, motions)):,} pairs of scans of {' '.join(names)}, {config.epochs} epochs "
+        f"of {steps_per_epoch(motions, config)} batches -> {run}\nloss: eq. 2, metres and degrees alike")
+    if not sequences and (gone := set(SPLITS["train"]) - set(names)):
+        say(f"of the training split {' '.join(sorted(gone))} are not there")
     net = fit(net, geometry[:len(chosen)], motions, run, seed, device, state, say, **remember)
     if held_out:
         source = {"weights": str(run / "weights.pt"), "data": str(root)}
@@ -1035,8 +1040,8 @@ def check_device(device):
     """ValueError when this PyTorch cannot use the device."""
     try:
         torch.empty(0, device=device)
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        raise ValueError(f"--device {device}: this PyTorch has none ({str(error).splitlines()[0]})") from None
+    except (RuntimeError, AssertionError, NotImplementedError):
+        raise ValueError(f"--device {device}: this PyTorch has none; cpu, or on a machine with one cuda or mps") from None
 
 
 def keep_freed_memory():

@@ -39,8 +39,10 @@ def _check_scan_size(path, size):
 
 def read_scan(path: str | Path) -> np.ndarray:
     """One velodyne/*.bin -> (N,4) float32: x, y, z [m] in the Velodyne frame, intensity 0..1, as in the file (NaN included).
-    Raises FileNotFoundError, or ValueError when the file is empty or its size is no multiple of 16 bytes."""
+    Raises FileNotFoundError, or ValueError when the file is empty, of another format, or its size is no multiple of 16 bytes."""
     data = _read(path, "give the path of a KITTI scan (velodyne/000000.bin)")
+    if data.startswith((b"\x93NUMPY", b"ply\n", b"ply\r", b"# .PCD")):
+        raise ValueError(f"{path} is no KITTI scan but another format: read it with its own library and hand over x, y, z, intensity.")
     _check_scan_size(path, len(data))
     return np.frombuffer(data, "<f4").reshape(-1, 4).astype(np.float32)  # (N,4), a copy that may be written to
 
@@ -48,7 +50,7 @@ def read_scan(path: str | Path) -> np.ndarray:
 def read_calib(path: str | Path) -> np.ndarray:
     """calib.txt of a sequence -> T_cam0_velo (4,4) float64, its row `Tr`: Velodyne points to the rectified left camera [m].
     Raises FileNotFoundError; ValueError when `Tr` is missing, is not 12 finite numbers or does not hold a rotation."""
-    get = "download the odometry calibration archive (data_odometry_calib.zip)"
+    get = "it is in KITTI's data_odometry_calib.zip; for scans and poses of your own in one frame write the line Tr: 1 0 0 0 0 1 0 0 0 0 1 0"
     row = re.search(rb"^\s*Tr\s*:(.*)$", _read(path, get), re.M)
     if row is None:
         raise ValueError(f"{path} has no row 'Tr' (Velodyne to camera): {get}, the calibration of the images alone will not do.")

@@ -207,7 +207,8 @@ def draw(path, trajectories):
         lengths = by_length([] if T_gt is None else [segment_errors(T_gt, T_est)])
         for axis, error, unit in zip(errors, ("E_t", "E_r"), ("%", "deg/m")):
             axis.plot([int(m.split()[0]) for m in lengths], [s[error] for s in lengths.values()], "ko-")
-            axis.set(title=f"{name}: {error} by length" + " (no segment)" * (not lengths), xlabel="length of the segments [m]",
+            axis.text(450, 0.5, "no segment" * (not lengths), ha="center")
+            axis.set(title=f"{name}: {error} by length", xlabel="length of the segments [m]",
                      ylabel=f"{error} [{unit}]", xlim=(50, 850), ylim=(0, 1.15 * max((s[error] for s in lengths.values()), default=0) or 1))
     for axis in rows.flat:
         axis.grid(color="0.9")

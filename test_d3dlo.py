@@ -1072,6 +1072,7 @@ BAD_DATA = {    # what is done to a good root, and what the complaint must name
     "a scan missing": (lambda root: (root / SCAN).unlink(), SCAN[-10:]),
     "a scan cut short": (rewrite(SCAN, lambda b: b[:-3]), SCAN),
     "an empty scan": (rewrite(SCAN, lambda b: b""), SCAN),
+    "another format": (rewrite(SCAN, lambda b: b"\x93NUMPY" + b[:-6]), SCAN),
     "too few points": (rewrite(SCAN, lambda b: b[:16 * 1000]), SCAN),
     "only NaN": (rewrite(SCAN, lambda b: b"\xff" * len(b)), SCAN),
     "a pose too few": (rewrite(POSES, lambda b: b"\n".join(b.splitlines()[1:])), POSES),

@@ -3,9 +3,10 @@
     python benchmarks/looks.py ROOT [NN ...]        # folders in KITTI odometry layout
     python benchmarks/looks.py data/full 00 01 02 08 09
 
-For each sequence, over 8 scans spread evenly: usable points, mean intensity, share of points in the fullest 0.3 m of height, share of the
-centroids more than 0.5 m above the road. Then of these, by range: how thick the surface is within 1 m (smallest standard deviation, median),
-how round (smallest over largest, mean), and how far the nearest point of the next scan lies once the true motion is undone (median).
+For each sequence, over 8 scans spread evenly: usable points, mean intensity, share of points in the fullest 0.3 m of height (the ground),
+share of the centroids more than 0.5 m above the road (raised). Then of these, by range: how thick the surface is within 1 m [m] (smallest
+standard deviation, median), how round (smallest over largest, mean), and how far the nearest point of the next scan lies once the true
+motion is undone [m] (median).
 """
 import argparse
 import sys
@@ -42,12 +43,14 @@ def main():
     parser.add_argument("names", nargs="*", metavar="NN")
     args = parser.parse_args()
     config = d3dlo.Config()
+    try:
+        sequences = kitti.open_sequences(args.root, args.names or "all")
+        truth = [s.motions() for s in sequences]
+    except (ValueError, OSError) as error:
+        sys.exit(f"looks: {error}")
     print(f"{'sequence':<12}points  intensity  ground  raised   "
           + "   ".join(f"{a:2d} to {b} m: thick round next" for a, b in zip(EDGES, EDGES[1:])))
-    for s in kitti.open_sequences(args.root, args.names or "all"):
-        if s.poses is None:
-            sys.exit(f"{s.folder}: needs ground truth, poses/{s.name}.txt")
-        motions = s.motions()
+    for s, motions in zip(sequences, truth):
         looks, rows, raised = zip(*(of_pair(s.scan(i), s.scan(i + 1), motions[i], config) for i in np.linspace(0, len(s) - 2, 8).astype(int)))
         (points, intensity, _, ground), rows = np.mean(looks, 0), np.concatenate(rows)
         line = f"{s.name:<12}{points:6.0f}  {intensity:9.2f}  {ground:6.2f}  {np.mean(raised):6.2f}   "
