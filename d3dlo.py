@@ -582,6 +582,11 @@ class Objective(nn.Module):
 
 # --------------------------------------------------------------------------------------------------------- odometry, eq. 1
 
+def checksum(model):
+    """Of all tensors of a state_dict."""
+    return zlib.crc32(b"".join(tensor.cpu().numpy().tobytes() for tensor in model.values()))
+
+
 def load_weights(path: str | Path | None = None, device: str = "cpu") -> tuple[D3DLO, dict]:
     """Weights file or run folder (None: those beside this file) -> (D3DLO in eval mode, the file's dict).
     The network is rebuilt from the file itself. FileNotFoundError, ValueError."""
@@ -596,7 +601,7 @@ def load_weights(path: str | Path | None = None, device: str = "cpu") -> tuple[D
         net = D3DLO(Config(**state["config"]))
         net.load_state_dict(state["model"])
         state["step"], state["train"].values()          # all must be there
-        if np.shape(state["mean_motion"]) != (6,) or np.shape(state["seen"]) != (2, len(LOOKS)):
+        if checksum(state["model"]) != state["crc"] or np.shape(state["mean_motion"]) != (6,) or np.shape(state["seen"]) != (2, len(LOOKS)):
             raise ValueError("damaged")
     except Exception as error:      # torch and pickle raise many kinds; to the user they are one
         reason = f"{type(error).__name__}: {error}".splitlines()[-1].strip()
@@ -777,11 +782,11 @@ def mean_loss(net, examples, objective=loss_unweighted):
     return float(np.mean([objective(net(batch), target).item() for batch, target in examples]))
 
 
-def save(path, **state):
-    """A dictionary of tensors and plain values to a file, through a temporary one."""
-    with metrics.replacing(path) as temporary:
+def save(path, model, **state):
+    """The state_dict of a network and plain values to a file, through a temporary one."""
+    with metrics.replacing(path) as temporary, open(temporary, "wb") as file:       # of a file's name torch would write it into the file
         try:
-            torch.save(state, temporary)
+            torch.save({**state, "model": model, "crc": checksum(model)}, file)
         except RuntimeError as error:                   # torch's word for a full disk
             raise OSError(f"{path}: not written ({str(error).splitlines()[0]:.80})") from None
 

@@ -823,8 +823,7 @@ def test_a_bad_scan_leaves_nothing_in_the_cache_and_is_named(tmp_path):
 def save_weights(path, config=Config(), seen=([1.0, 0.1, 1.0, 0.01], [1e6, 1.0, 100.0, 1.0])):
     """A file as `fit` writes it, of a network that was never trained."""
     net = a_net(generator(0), config)
-    torch.save(dict(config=config.as_dict(), model=net.state_dict(), step=0, train={}, mean_motion=[1.0, 0, 0, 0, 0, 0],
-                    seen=seen), path)
+    d3dlo.save(path, config=config.as_dict(), model=net.state_dict(), step=0, train={}, mean_motion=[1.0, 0, 0, 0, 0, 0], seen=seen)
     return net
 
 
@@ -1128,6 +1127,7 @@ def torch_bytes(content):
 
 BAD_WEIGHTS = {     # the bytes of a good file -> those of a bad one
     "another shape": lambda good: torch_bytes({**torch.load("good.pt"), "config": Config().as_dict()}),
+    "other numbers": lambda good: torch_bytes((state := torch.load("good.pt")) | {"model": {k: v + 1 for k, v in state["model"].items()}}),
     "code": lambda good: pickle.dumps(Mischief(), protocol=2), "code by torch": lambda good: torch_bytes({"model": Mischief()}),
     "cut short": lambda good: good[:-2000], "no config": lambda good: torch_bytes({"model": {}}), "a list": lambda good: torch_bytes([1.0]),
     "noise": lambda good: generator(0).bytes(5000), "empty": lambda good: b"", "text": lambda good: b"hello",

@@ -99,7 +99,7 @@ def readers(folder, rng):
     d3dlo.save(folder / "weights.pt", **weights)
     records = np.stack([d3dlo.scan_geometry(scan, SMALL)] * 3)
     np.save(folder / "cache.npy", records)
-    (folder / "config.json").write_text(json.dumps(dict(arguments=dict(data=None, sequences=["00"], seed=0), config=SMALL.as_dict())))
+    (folder / "config.json").write_text(json.dumps(dict(arguments=dict(data=None, sequences=["00"], seed=0, weights=None), config=SMALL.as_dict())))
     (folder / "calib.txt").write_text(kitti._calibration()[1])
     scan.tofile(folder / "000000.bin")
 
