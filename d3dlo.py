@@ -600,7 +600,7 @@ def load_weights(path: str | Path | None = None, device: str = "cpu") -> tuple[D
         state = torch.load(path, map_location="cpu", weights_only=True)
         net = D3DLO(Config(**state["config"]))
         net.load_state_dict(state["model"])
-        state["step"], state["train"].values()          # all must be there
+        state["step"], {*state["train"].values(), *state["before"]}     # all must be there
         if checksum(state["model"]) != state["crc"] or np.shape(state["mean_motion"]) != (6,) or np.shape(state["seen"]) != (2, len(LOOKS)):
             raise ValueError("damaged")
     except Exception as error:      # torch and pickle raise many kinds; to the user they are one
@@ -919,7 +919,8 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu",
     out = Path(out)
     errors = {s.name: run_network(net, state, s, records, out, device, refine)
               for s, records in progress(zip(sequences, geometry), len(sequences), "registering, sequences")}
-    trained_on = {s.name: fingerprint(s) in state["train"].values() for s in sequences}
+    seen = {*state["train"].values(), *state["before"]}
+    trained_on = {s.name: fingerprint(s) in seen for s in sequences}
 
     def summary(names, predictor="network"):
         some = [errors[name][predictor] for name in names if errors[name]]
@@ -968,7 +969,7 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     if resume:
         config, data, sequences, seed, weights = begun_with(run)
     data, weights = (path and str(Path(path).resolve()) for path in (data, weights))
-    checkpoint, before = run / "checkpoint.pt", {"train": {}, "seen": []}
+    checkpoint, before = run / "checkpoint.pt", {"train": {}, "before": [], "seen": []}
     state = load_weights(checkpoint, device)[1] if resume and checkpoint.exists() else None
     if weights and not state:
         first, before = load_weights(weights)
@@ -986,17 +987,17 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     digests = {s.name: fingerprint(s) for s in chosen}
     if state and "losses" not in state:
         raise ValueError(f"{checkpoint}: holds weights, but no training to go on with")
-    if state and not digests.items() <= state["train"].items():
+    if state and state["train"] != digests:
         raise ValueError(f"{checkpoint}: was trained on other data than lies there now; resume with the data it was begun with")
     geometry = load_geometry(chosen + held_out, config)
     if state:
-        remember = {name: state[name] for name in ("train", "mean_motion", "seen")}
+        remember = {name: state[name] for name in ("train", "before", "mean_motion", "seen")}
     else:
         looks = np.concatenate([*(records["looks"] for records in geometry[:len(chosen)]), np.reshape(before["seen"], (-1, len(LOOKS)))])
-        remember = {"train": {f"{name}, before": digest for name, digest in before["train"].items()} | digests,
+        remember = {"train": digests, "before": sorted({*before["before"], *before["train"].values()}),
                     "mean_motion": to_vector(np.concatenate(motions)).mean(0).tolist(), "seen": [looks.min(0).tolist(), looks.max(0).tolist()]}
 
-    note_beginning(run, dict(data=data, sequences=names, seed=seed, device=device, weights=weights), config, remember["train"])
+    note_beginning(run, dict(data=data, sequences=names, seed=seed, device=device, weights=weights), config, digests)
 
     def say(line):
         print(line, flush=True)

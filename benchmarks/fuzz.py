@@ -95,7 +95,7 @@ def readers(folder, rng):
     metrics.write_poses(folder / "poses.txt", poses)
     net = d3dlo.D3DLO(SMALL)
     weights = dict(config=SMALL.as_dict(), model=net.state_dict(), step=1, train={"00": "0" * 16}, mean_motion=[0.0] * 6,
-                   seen=[[1.0] * len(d3dlo.LOOKS)] * 2)
+                   before=[], seen=[[1.0] * len(d3dlo.LOOKS)] * 2)
     d3dlo.save(folder / "weights.pt", **weights)
     records = np.stack([d3dlo.scan_geometry(scan, SMALL)] * 3)
     np.save(folder / "cache.npy", records)
