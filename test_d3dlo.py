@@ -356,7 +356,7 @@ def test_the_prediction_knows_neither_the_order_of_points_nor_absolute_coordinat
     rng = generator(seed)
     net = a_net(rng)
     p, q = (np.round(cloud(rng, 108) * 1024) / 1024 for _ in range(2))              # a grid on which shifting by metres is exact
-    expected, shift = predict(net, p, q), np.float32([40, -30, 3, 0])
+    expected, shift = predict(net, p, q), np.float32([20, -24, 3, 0])
     assert_array_equal(predict(net, *(np.r_[s[:1], rng.permutation(s[1:])] for s in (p, q))), expected)
     assert_allclose(predict(net, p + shift, q + shift), expected, atol=1e-3)        # another motion, but the same flow
     assert np.abs(predict(net, p, q + shift / 32) - expected).max() > 0.01          # shifting one alone does matter
@@ -880,7 +880,7 @@ def test_odometry_drops_points_that_are_not_finite_with_a_warning(tmp_path):
     save_weights(tmp_path / "w.pt", SMALL)
     p, q = cloud(generator(0), 60), cloud(generator(1), 60)
     expected = d3dlo.relative_pose(p, q, tmp_path / "w.pt")
-    with pytest.warns(UserWarning, match="1 NaN"):
+    with pytest.warns(UserWarning, match="left out 1 "):
         assert_array_equal(d3dlo.relative_pose(p, np.insert(q, 7, np.nan, axis=0), tmp_path / "w.pt"), expected)
 
 
