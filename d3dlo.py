@@ -199,8 +199,8 @@ def group_ball(xyz: np.ndarray, centroids: np.ndarray, r: float, n_n: int, tree:
     included: the nearest n_n, or with spread > 1 n_n in even steps, from first to last, of the nearest spread * n_n.
 
     The first is the centroid (or a point in the same place). Where there are fewer, the missing slots hold the centroid's own
-    index (section 3.3.2, of an empty ball). That changes no maximum, though it counts in BatchNorm's statistics, and it is common: on real scans
-    10 to 18 % of SA1's balls have fewer than 8 points. `tree`, a cKDTree of xyz, saves building one.
+    index (section 3.3.2, of an empty ball). That changes no maximum, though it counts in BatchNorm's statistics, and it is common: on
+    real scans 10 to 18 % of SA1's balls have fewer than 8 points. `tree`, a cKDTree of xyz, saves building one.
     """
     # ranks as a list: for the number 1 scipy would drop the axis
     _, idx = (tree or cKDTree(xyz)).query(xyz[centroids], [*range(1, spread * n_n + 1)], distance_upper_bound=np.nextafter(r, np.inf))
@@ -342,7 +342,7 @@ def load_geometry(sequences, config, cache="cache"):
     geometry = [np.load(file, mmap_mode="r") if records is None else records for file, records in zip(files, geometry)]
     for s, records in zip(sequences, geometry):
         if records["dropped"].any():
-            print(f"sequence {s.name}: left out {records['dropped'].sum()} points that are not finite in "
+            print(f"sequence {s.name}: left out {records['dropped'].sum()} broken points (not finite, or intensity beyond 65,536) in "
                   f"{np.count_nonzero(records['dropped'])} of {len(s)} scans", file=sys.stderr)
     return geometry
 
@@ -665,11 +665,11 @@ class Odometry:
 
     def register(self, scan: np.ndarray) -> np.ndarray:
         """(N,4) float32 x, y, z [m], intensity 0..1 -> pose (4,4) float64 T_{0,t} of this scan in the first one's Velodyne frame,
-        the identity for the first. The motion depends on the last two scans alone. Points that are not finite are left out with a
-        warning; ValueError for a scan that is refused, which changes nothing."""
+        the identity for the first. The motion depends on the last two scans alone. Broken points are left out with a warning;
+        ValueError for a scan that is refused, which changes nothing."""
         record = scan_geometry(scan, self.net.config)
         if record["dropped"]:
-            warnings.warn(f"left out {record['dropped']} points that are not finite", stacklevel=2)
+            warnings.warn(f"left out {record['dropped']} broken points (not finite, or intensity beyond 65,536)", stacklevel=2)
         if self.seen and (strange := unlike(record["looks"], self.seen)):
             warnings.warn(f"a scan unlike those the weights were trained on, do not trust the answer: {strange}", stacklevel=2)
             self.seen = None                            # said once
@@ -820,6 +820,15 @@ def training_step(objective, net, batch, target, minimizers):
     return loss.item(), rate
 
 
+def parts_of(net, steps, device="cpu"):
+    """All that a training of so many steps changes, which is what a checkpoint holds: {name: network, objective, optimisers, schedules}."""
+    objective = Objective(net.config).to(device)
+    parts = {"model": net, "objective": objective}
+    for i, optimizer in enumerate(optimizers(net, objective)):
+        parts |= {f"optimizer{i}": optimizer, f"scheduler{i}": schedule(optimizer, net.config, steps)}
+    return parts
+
+
 def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=print, **remember):
     """Train `net` as its config says (section 4). Returns a net for use, with BatchNorm's statistics recomputed.
 
@@ -827,10 +836,8 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
     with `remember` in both. When interrupted finishes its step, writes the checkpoint and raises KeyboardInterrupt."""
     config, per_epoch, run = net.config, steps_per_epoch(motions, net.config), Path(run)
     total = config.epochs * per_epoch
-    objective = Objective(config).to(device)
-    parts = {"model": net, "objective": objective}
-    for i, optimizer in enumerate(optimizers(net, objective)):
-        parts |= {f"optimizer{i}": optimizer, f"scheduler{i}": schedule(optimizer, config, total)}
+    parts = parts_of(net, total, device)
+    _, objective, *minimizers = parts.values()
     step, losses = 0, []
     if resume:
         step, losses = resume["step"], resume["losses"]
@@ -857,7 +864,7 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
     todo = batches(geometry, motions, config, (seed,), step, total, device)
     with interruption_waits() as came:
         for batch, target in progress(todo, total - step, f"training, batches of {config.batch} pairs, swap: {config.swap}"):
-            loss, rate = training_step(objective, net, batch, target, list(parts.values())[2:])
+            loss, rate = training_step(objective, net, batch, target, minimizers)
             step += 1
             losses.append(loss)
             if step % per_epoch == 0:
@@ -947,14 +954,36 @@ def evaluate_network(net, state, sequences, geometry, out, source, device="cpu",
 
 # ------------------------------------------------------------------------------------------------------------- command line
 
-def data_root(data, asked=(), made=None):
-    """The folder `data`, or if None that of the simulated city, of which the sequences `made` (None: all) are made where missing. ValueError
-    when one asked for is none of its."""
+def data_root(data, names, whole=False):
+    """The folder `data`, or if None that of the simulated city, of which the sequences named, or the `whole`, are made where missing.
+    ValueError for a name it does not know."""
+    names = [names] if isinstance(names, str) else names or ()
     if data:
         return Path(data)
-    if strange := set(asked) - {"all", *SPLITS, *sum(SPLITS.values(), ())}:
-        raise ValueError(f"the simulated city has no sequence {' '.join(sorted(strange))}: there are 00 to 10, the splits {', '.join(SPLITS)}, and all")
-    return kitti.simulate(SIMULATED, **({"sequences": made} if made else {}))
+    if strange := set(names) - {"all", *SPLITS, *sum(SPLITS.values(), ())}:
+        raise ValueError(f"the simulated city has no sequence {' '.join(sorted(strange))}: there are 00 to 10, the splits {', '.join(SPLITS)}, "
+                         "and all")
+    return kitti.simulate(SIMULATED, sequences="all" if whole else names)
+
+
+def choose(root, names=None):
+    """Lists of `Sequence`: those to train on (names None: the training split, or without any of it all that is in no split), and those of the
+    test and validation splits that are there beside them. ValueError when there is nothing to train on."""
+    there, held_out = [s.name for s in kitti.open_sequences(root)], SPLITS["test"] + SPLITS["validation"]
+    names = names or [n for n in SPLITS["train"] if n in there] or [n for n in there if n not in held_out]
+    if not names:
+        raise ValueError(f"{root}: holds only sequences of the test and validation splits, {' '.join(there)}; --sequences names those to train on")
+    chosen = kitti.open_sequences(root, names)
+    if not sum(len(s) - 1 for s in chosen):
+        raise ValueError(f"{root}: sequence {' '.join(s.name for s in chosen)} has a single scan; training needs pairs")
+    return chosen, kitti.open_sequences(root, [n for n in held_out if n in there and n not in [s.name for s in chosen]])
+
+
+def remembered(digests, motions, geometry, before):
+    """What a file of weights holds of the data of its training, `before` being what the weights held that it began from."""
+    looks = np.concatenate([*(records["looks"] for records in geometry), np.reshape(before["seen"], (-1, len(LOOKS)))])
+    return {"train": digests, "before": sorted({*before["before"], *before["train"].values()}),
+            "mean_motion": to_vector(np.concatenate(motions)).mean(0).tolist(), "seen": [looks.min(0).tolist(), looks.max(0).tolist()]}
 
 
 def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu", resume=False, weights=None):
@@ -971,32 +1000,20 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     data, weights = (path and str(Path(path).resolve()) for path in (data, weights))
     checkpoint, before = run / "checkpoint.pt", {"train": {}, "before": [], "seen": []}
     state = load_weights(checkpoint, device)[1] if resume and checkpoint.exists() else None
-    if weights and not state:
+    if state:
+        before = state | {"train": {}}
+    elif weights:
         first, before = load_weights(weights)
         config = replace(first.config, **{name: getattr(config, name) for name in SHORT})
-    root = data_root(data, sequences or ())
-    there = [s.name for s in kitti.open_sequences(root)]
-    ours = [n for n in SPLITS["train"] if n in there] or [n for n in there if n not in SPLITS["test"] + SPLITS["validation"]]
-    if not (sequences or ours):
-        raise ValueError(f"{root}: holds only sequences of the test and validation splits, {' '.join(there)}; --sequences names those to train on")
-    chosen = kitti.open_sequences(root, sequences or ours)
-    names, motions = [s.name for s in chosen], [s.motions() for s in chosen]
-    if not sum(map(len, motions)):
-        raise ValueError(f"{root}: sequence {' '.join(names)} has a single scan; training needs pairs")
-    held_out = kitti.open_sequences(root, [n for n in SPLITS["test"] + SPLITS["validation"] if n in there and n not in names])
-    digests = {s.name: fingerprint(s) for s in chosen}
+    root = data_root(data, sequences, whole=True)
+    chosen, held_out = choose(root, sequences)
+    names, motions, digests = [s.name for s in chosen], [s.motions() for s in chosen], {s.name: fingerprint(s) for s in chosen}
     if state and "losses" not in state:
         raise ValueError(f"{checkpoint}: holds weights, but no training to go on with")
     if state and state["train"] != digests:
         raise ValueError(f"{checkpoint}: was trained on other data than lies there now; resume with the data it was begun with")
     geometry = load_geometry(chosen + held_out, config)
-    if state:
-        remember = {name: state[name] for name in ("train", "before", "mean_motion", "seen")}
-    else:
-        looks = np.concatenate([*(records["looks"] for records in geometry[:len(chosen)]), np.reshape(before["seen"], (-1, len(LOOKS)))])
-        remember = {"train": digests, "before": sorted({*before["before"], *before["train"].values()}),
-                    "mean_motion": to_vector(np.concatenate(motions)).mean(0).tolist(), "seen": [looks.min(0).tolist(), looks.max(0).tolist()]}
-
+    remember = remembered(digests, motions, geometry[:len(chosen)], before)
     note_beginning(run, dict(data=data, sequences=names, seed=seed, device=device, weights=weights), config, digests)
 
     def say(line):
@@ -1008,8 +1025,8 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     net = D3DLO(config).to(device)
     if weights and not state:
         net.load_state_dict(first.state_dict())
-    say(f"{sum(p.numel() for p in net.parameters()):,} parameters, {sum(map(len, motions)):,} pairs of scans of {' '.join(names)}, {config.epochs} epochs "
-        f"of {steps_per_epoch(motions, config)} batches -> {run}\nloss: eq. 2, metres and degrees alike")
+    say(f"{sum(p.numel() for p in net.parameters()):,} parameters, {sum(map(len, motions)):,} pairs of scans of {' '.join(names)}, "
+        f"{config.epochs} epochs of {steps_per_epoch(motions, config)} batches -> {run}\nloss: eq. 2, metres and degrees alike")
     if not sequences and (gone := set(SPLITS["train"]) - set(names)):
         say(f"of the training split {' '.join(sorted(gone))} are not there")
     net = fit(net, geometry[:len(chosen)], motions, run, seed, device, state, say, **remember)
@@ -1029,7 +1046,7 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
         metrics.picture(1, 1)                                   # say so now if it cannot be drawn, not after the work
     out = Path(out or time.strftime("results/%Y-%m-%d-%H%M%S"))
     sequences = sequences or ("all" if data else ("test", "validation"))
-    root = data_root(data, sequences, None if "all" in sequences else sequences)
+    root = data_root(data, sequences)
     chosen = kitti.open_sequences(root, sequences)
     for s in chosen:
         if s.poses is None and (s.folder / "poses.txt").exists():
@@ -1101,8 +1118,8 @@ def positive(text):
     return number(text, 1)
 
 
-def main(argv=None):
-    """The command line -> exit code: 0, 2 for bad input, 130 when interrupted."""
+def command_line():
+    """The parsers of the program and of its command `train`."""
     raw = argparse.RawDescriptionHelpFormatter
     paragraphs = __doc__.split("\n\n")
     parser = argparse.ArgumentParser(prog="d3dlo", formatter_class=raw, description=f"{paragraphs[0]}\n\n{paragraphs[-1]}")
@@ -1148,6 +1165,22 @@ def main(argv=None):
     results = e.add_argument_group("results")
     results.add_argument("--out", metavar="DIR", help="folder for NN.txt and results.json (default: results/TIME)")
     results.add_argument("--plot", action="store_true", help="draw the paths and the errors by length; needs matplotlib")
+    return parser, t
+
+
+def config_from(args):
+    """The Config that `train` was asked for; its options are taken out of args, the rest is what the function takes."""
+    if args["weights"] and (args["neighbors"] or not args["plane"]):
+        raise ValueError("--weights brings its network along; leave out --neighbors and --no-plane")
+    config = Config(**(SHORT if args.pop("short") or not args["data"] else {}), plane=args.pop("plane"))
+    given = {name: args.pop(name) for name in ("epochs", "batch", "lr")}
+    n_n = args.pop("neighbors") or config.sa1.n_n
+    return replace(config, sa1=config.sa1._replace(n_n=n_n), **{name: x for name, x in given.items() if x is not None})
+
+
+def main(argv=None):
+    """The command line -> exit code: 0, 2 for bad input, 130 when interrupted."""
+    parser, t = command_line()
     args = vars(parser.parse_args(argv))
     keep_freed_memory()
     kitti.terminate_as_interrupted()
@@ -1157,12 +1190,7 @@ def main(argv=None):
         else:
             if args["resume"] and any(args[k] != t.get_default(k) for k in args.keys() - {"resume", "out", "device"}):
                 raise ValueError("--resume goes on with the options the run was begun with; give only --out RUN, and --device")
-            if args["weights"] and (args["neighbors"] or not args["plane"]):
-                raise ValueError("--weights brings its network along; leave out --neighbors and --no-plane")
-            config = Config(**(SHORT if args.pop("short") or not args["data"] else {}), plane=args.pop("plane"))
-            given = {name: args.pop(name) for name in ("epochs", "batch", "lr")}
-            given = {name: x for name, x in given.items() if x is not None}
-            train(replace(config, **given, sa1=config.sa1._replace(n_n=args.pop("neighbors") or config.sa1.n_n)), **args)
+            train(config_from(args), **args)
     except KeyboardInterrupt as interruption:
         print(f"\nd3dlo: interrupted; {str(interruption) or 'run it again; a training goes on by train --out RUN --resume'}", file=sys.stderr)
         return 130

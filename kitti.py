@@ -612,8 +612,8 @@ def _simulate_scan(name, seed, scans, azimuth, i):
     light = shade * (0.65 + 0.4 * np.sqrt(cosine)) + 0.08 * noise() - 0.01 * np.maximum(r - 25, 0)  # from 60 m on KITTI's are mostly 0
     light *= rng.random(len(ray), dtype=f4) > 0.08
     back = (rng.random(len(ray), dtype=f4) > lost) & (r < CITY_RANGE) & (r > MIN_RANGE)
-    ray, r, light = ray[back], r[back], light[back]
-    d, col = r * rays.cos_w[ray], ray % azimuth
+    ray, col, r, light = ray[back], col[back], r[back], light[back]
+    d = r * rays.cos_w[ray]
     x, y, z = d * rays.cos_a[col], d * rays.sin_a[col], r * rays.sin_w[ray]  # from the eye, axes of the world
     z += (hills(x + f4(eye[0]), y + f4(eye[1])) - hills(*eye[:2])).astype(f4)  # what a crest would hide is still seen
     x, y, z = (x * q[0] + y * q[1] + z * q[2] for q in R.T.astype(f4))  # R^T turns them into the sensor's; no BLAS, whose sums depend on its threads

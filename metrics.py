@@ -110,8 +110,8 @@ def segment_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
 
     (n,4,4), (n,4,4) -> structured array with fields first, last (frames), length [m], t_err [%], r_err [deg/m].
     A segment starts at every 10th frame and ends at the first frame whose path from there is strictly longer than 100, 200,
-    ... 800 m of true path; errors are divided by that nominal length, not by the straight distance that eqs. 7 and 8 name. The devkit sums the path in float32, which may move
-    `last` by a frame; here it is float64. ValueError when the lengths differ.
+    ... 800 m of true path; errors are divided by that nominal length, not by the straight distance that eqs. 7 and 8 name. The devkit
+    sums the path in float32, which may move `last` by a frame; here it is float64. ValueError when the lengths differ.
     """
     T_gt, T_est = _same_length(T_gt, T_est)
     path = path_lengths(T_gt)
@@ -121,7 +121,7 @@ def segment_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
     delta_gt = np.linalg.inv(T_gt[first]) @ T_gt[last]
     delta_est = np.linalg.inv(T_est[first]) @ T_est[last]
     error = np.linalg.inv(delta_est) @ delta_gt     # (segments,4,4); the inverse of the paper's, as in the devkit: same length and angle
-    cosine = (np.trace(error[:, :3, :3], axis1=1, axis2=2) - 1) / 2                 # eq. 6, by the arccos for the devkit's digits; _angle is for steps
+    cosine = (np.trace(error[:, :3, :3], axis1=1, axis2=2) - 1) / 2                 # eq. 6; arccos, as in the devkit
     out = np.empty(len(first), SEGMENT)
     out["first"], out["last"], out["length"] = first, last, length
     out["t_err"] = 100 * np.linalg.norm(error[:, :3, 3], axis=1) / length

@@ -14,11 +14,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-try:
-    from matplotlib.figure import Figure
-except ImportError:
-    sys.exit("pictures: this needs matplotlib: pip install \".[plot]\"")
-
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import d3dlo
 import kitti
@@ -39,7 +34,7 @@ def method(root, name, i):
     xyz, n2, n3 = p["xyz"], config.sa2.n_fps, config.sa3.n_fps
     distance = np.linalg.norm(xyz[:n2, :2], axis=1)
     one = int(np.argmin(np.abs(distance - 12) + 10 * (xyz[:n2, 2] < -1)))      # something upright, 12 m away
-    figure = Figure(figsize=(14, 3.9), layout="constrained")
+    figure = metrics.picture(14, 3.9)
     all_, ball, wide, flow = figure.subplots(1, 4)
     all_.scatter(scan[:, 1], scan[:, 0], **GREY)
     all_.scatter(xyz[:, 1], xyz[:, 0], **BLACK)
@@ -65,7 +60,7 @@ def method(root, name, i):
 
 def curve(runs):
     """The loss of each epoch, from the trainings' logs."""
-    figure = Figure(figsize=(6, 3.5), layout="constrained")
+    figure = metrics.picture(6, 3.5)
     axis = figure.subplots()
     for run, style in zip(runs, ("k-", "k--", "k:", "k-.") * len(runs)):
         losses = re.findall(r"^epoch (\d+)/\d+: loss ([\d.]+)", (run / "log.txt").read_text(encoding="utf-8"), re.M)
@@ -84,7 +79,7 @@ def budget(runs):
         config, results = d3dlo.Config(**state["config"]), json.loads((run / "results" / "results.json").read_text())["pooled"]["test"]["network"]
         points.append((state["step"] * config.batch * (2 if config.swap == "both" else 1), results["E_t"], results["t_step_m"], results["r_step_deg"]))
     steps, *errors = np.array(sorted(points)).T
-    figure = Figure(figsize=(10, 3), layout="constrained")
+    figure = metrics.picture(10, 3)
     for axis, error, label in zip(figure.subplots(1, 3), errors, ("E_t [%]", "error of a step [m]", "error of a step [deg]")):
         axis.loglog(steps, error, "ko-")
         axis.set(xlabel="pair-steps of the whole training", ylabel=label)
