@@ -16,7 +16,7 @@ B pairs of scans, C clouds (scans) in a batch, D features.
     python d3dlo.py train --data ROOT           # KITTI odometry, the paper's schedule
     python d3dlo.py eval --data ROOT            # with the weights beside this file
 """
-import argparse, ctypes, hashlib, json, math, platform, signal, subprocess, sys, threading, time, warnings, zipfile, zlib
+import argparse, ctypes, hashlib, itertools, json, math, platform, signal, subprocess, sys, threading, time, warnings, zipfile, zlib
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -115,10 +115,7 @@ SHORT = dict(epochs=9, batch=8, optimizer="muon", lr=1e-2, schedule="one-cycle",
 
 def accumulate(motions):
     """Eq. 1: (n-1,4,4) T_{t,t+1} -> (n,4,4) T_{0,t}, the first the identity."""
-    poses = [np.eye(4)]
-    for T in motions:
-        poses.append(poses[-1] @ T)
-    return np.stack(poses)
+    return np.stack([*itertools.accumulate(motions, np.matmul, initial=np.eye(4))])
 
 
 def to_output(T, config):
