@@ -358,11 +358,9 @@ class Batch(NamedTuple):
 def make_batch(clouds, p, q, config, device="cpu"):
     """(C,) records, (B,) and (B,) indices of them -> Batch on `device`. The one thing computed here is what depends on a pair."""
     idx_fe = np.stack([group_knn(clouds["xyz"][j], clouds["xyz"][i], config.fe.n_n) for i, j in zip(p, q)])
-
-    def tensor(array):
-        return torch.from_numpy(np.ascontiguousarray(array)).to(device)
-    return Batch(tensor(clouds["xyz"]), tensor(clouds["group"]), tensor(clouds["idx2"].astype(np.int64)),
-                 tensor(clouds["idx3"].astype(np.int64)), tensor(p), tensor(q), tensor(idx_fe))
+    idx2, idx3 = clouds["idx2"].astype(np.int64), clouds["idx3"].astype(np.int64)
+    arrays = Batch(clouds["xyz"], clouds["group"], idx2, idx3, p, q, idx_fe)
+    return Batch(*(torch.from_numpy(np.ascontiguousarray(array)).to(device) for array in arrays))
 
 
 # --------------------------------------------------------------------------------------------- section 3.3: the network (torch)
