@@ -420,11 +420,6 @@ class LinearMax(torch.autograd.Function):
         return grad_h, grad_W, None
 
 
-def norm_relu(norm, z):
-    """ReLU(BN(z)) over the last axis of z (B,S,k,D). Seen as (B,D,S,k) it is channels-last, for which torch is fast."""
-    return F.relu_(norm(z.permute(0, 3, 1, 2))).permute(0, 2, 3, 1)
-
-
 def linear_norm_relu_max(linear, norm, h):
     """max over k of ReLU(BN(linear(h))): (B,S,k,D) -> (B,S,D').
 
@@ -464,9 +459,9 @@ class MiniPointNet(nn.Module):
 
     def rest(self, z):
         """All that follows the first linear layer, from its output (B,S,k,D1)."""
-        h = norm_relu(self.norms[0], z)
-        for linear, norm in zip(self.linears[1:-1], self.norms[1:-1]):
-            h = norm_relu(norm, linear(h))
+        for i, norm in enumerate(self.norms[:-1]):
+            z = self.linears[i](h) if i else z
+            h = F.relu_(norm(z.permute(0, 3, 1, 2))).permute(0, 2, 3, 1)       # (B,D,S,k) so seen is channels-last, for which torch is fast
         return linear_norm_relu_max(self.linears[-1], self.norms[-1], h)
 
 
