@@ -520,10 +520,8 @@ class D3DLO(nn.Module):
         """Batch -> (B,6): [tx, ty, tz] m and [roll, pitch, yaw] degrees of T_pq (section 3.2), extrinsic x-y-z (ours). With Config's
         quaternion (B,7), see `from_output`."""
         p, q, (n2, n3) = batch.p, batch.q, (batch.idx2.shape[1], batch.idx3.shape[1])
-        feat = self.sa1.h(batch.group[:, :, :self.config.sa1.n_n])                             # (C,1024,32), eq. 3; neighbours come gathered
-        if self.scales:
-            rest = batch.group[:, :, self.config.sa1.n_n:].split([scale.n_n for scale in self.config.scales], 2)
-            feat = torch.cat([feat, *(sa.h(group) for sa, group in zip(self.scales, rest))], 2)
+        groups = batch.group.split([scale.n_n for scale in (self.config.sa1, *self.config.scales)], 2)         # neighbours come gathered
+        feat = torch.cat([sa.h(group) for sa, group in zip((self.sa1, *self.scales), groups)], 2)              # (C,1024,32), eq. 3
         feat_p, feat_q = feat.index_select(0, p), feat.index_select(0, q)                      # feat[p] is slow on the way back
         xyz = batch.xyz[p]                                                                     # (B,1024,3)
         flow = self.fe(xyz, feat_p, batch.xyz[q], feat_q, batch.idx_fe)                        # (B,1024,64)
