@@ -237,12 +237,11 @@ def scan_geometry(scan: np.ndarray, config: Config = Config()) -> np.ndarray:
     """Sampling and grouping of all three set abstractions: scan (N,4) -> record of `geometry_dtype`. FPS is nested, so one
     sampling serves them all. Points that are not finite, beyond config.max_range or of absurd intensity are left out; ValueError when
     too few remain."""
-    with np.errstate(over="ignore"):
-        scan = np.asarray(scan, np.float32)
-    if scan.ndim != 2 or scan.shape[1] != 4:
-        raise ValueError(f"a scan has the shape (N, 4): x, y, z [m] and intensity, not {scan.shape}")
-    x, y, z, intensity = scan.T
     with np.errstate(over="ignore", invalid="ignore"):
+        scan = np.asarray(scan, np.float32)
+        if scan.ndim != 2 or scan.shape[1] != 4:
+            raise ValueError(f"a scan has the shape (N, 4): x, y, z [m] and intensity, not {scan.shape}")
+        x, y, z, intensity = scan.T
         finite = np.isfinite(x + y + z) & (np.abs(intensity) < 65536)       # no sensor gives more; it would end as NaN
         scan = np.ascontiguousarray(scan[finite & (x * x + y * y + z * z < config.max_range ** 2)])
     if not config.plane:
