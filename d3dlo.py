@@ -1093,90 +1093,78 @@ def begun_with(run):
         raise ValueError(f"{run}/config.json: missing or damaged, so there is no training to go on with; give its folder by --out") from None
 
 
-def number(text, least=0):
+def number(text):
     """For argparse."""
-    if int(text) < least:
-        raise argparse.ArgumentTypeError(f"must be {least} or more")
+    if int(text) < 0:
+        raise argparse.ArgumentTypeError("must be 0 or more")
     return int(text)
 
 
-def positive(text):
-    """For argparse."""
-    return number(text, 1)
-
-
 def command_line():
-    """The parsers of the program and of its command `train`."""
-    raw = argparse.RawDescriptionHelpFormatter
+    """The parser. What it gives holds only the options that were given: defaults are those of `train`, `evaluate` and `Config`."""
+    how = dict(formatter_class=argparse.RawDescriptionHelpFormatter, argument_default=argparse.SUPPRESS)
     paragraphs = __doc__.split("\n\n")
-    parser = argparse.ArgumentParser(prog="d3dlo", formatter_class=raw, description=f"{paragraphs[0]}\n\n{paragraphs[-1]}")
+    parser = argparse.ArgumentParser(prog="d3dlo", description=f"{paragraphs[0]}\n\n{paragraphs[-1]}", **how)
     commands = parser.add_subparsers(dest="command", required=True, metavar="train | eval")
-    t = commands.add_parser("train", formatter_class=raw, help="train, then evaluate on the test and validation splits", description=(
+    t = commands.add_parser("train", **how, help="train, then evaluate on the test and validation splits", description=(
         "Train D3DLO, then evaluate it on the test and validation splits.\n\n  python d3dlo.py train\n"
         "  python d3dlo.py train --data ROOT\n  python d3dlo.py train --data ROOT --sequences 00 01 --short --epochs 20\n"
         "  python d3dlo.py train --data ROOT --weights d3dlo.pt --short --lr 0.002\n"
         "  python d3dlo.py train --out RUN --resume"))
-    e = commands.add_parser("eval", formatter_class=raw, help="trajectories and KITTI's errors", description=(
+    e = commands.add_parser("eval", **how, help="trajectories and KITTI's errors", description=(
         "Run D3DLO over sequences, write their trajectories, print KITTI's errors.\n\n  python d3dlo.py eval\n"
         "  python d3dlo.py eval --data ROOT --sequences test\n  python d3dlo.py eval --data ROOT --weights RUN --sequences 11 12"))
-    device = dict(default="cpu", help="cpu, cuda or mps (default: cpu)")
-    for p in (t, e):
-        data = p.add_argument_group("data")
-        data.add_argument("--data", metavar="ROOT", help=f"folder in KITTI odometry layout (default: a simulated city, made in {SIMULATED})")
-        data.add_argument("--sequences", nargs="+", metavar="NN", help="names, or splits: train, test, validation, all")
+    for command in (t, e):
+        add = command.add_argument_group("data").add_argument
+        add("--data", metavar="ROOT", help=f"folder in KITTI odometry layout (default: a simulated city, made in {SIMULATED})")
+        add("--sequences", nargs="+", metavar="NN", help="names, or splits: train, test, validation, all")
 
-    network = t.add_argument_group("network")
-    network.add_argument("--weights", metavar="FILE|RUN", help="begin from these weights, with their network, and not from random ones")
-    network.add_argument("--neighbors", type=positive, metavar="N",
-                         help=f"n_n of the first set abstraction, Table 2 (default: {Config.sa1.n_n})")
-    network.add_argument("--no-plane", action="store_false", dest="plane", help="leave out the points of the ground plane, Table 2")
-    training = t.add_argument_group("training")
-    training.add_argument("--short", action="store_true",
-                          help="fewer epochs, one-cycle learning rate, Muon, augmentation (always without --data)")
-    training.add_argument("--epochs", type=positive, metavar="N", help=f"default: {Config.epochs}, short {SHORT['epochs']}")
-    training.add_argument("--batch", type=positive, metavar="N",
-                          help=f"pairs in a batch, each both ways (default: {Config.batch}, short {SHORT['batch']})")
-    training.add_argument("--lr", type=float, metavar="X", help=f"learning rate, at its highest (default: {Config.lr}, short {SHORT['lr']})")
-    training.add_argument("--seed", type=number, default=0, metavar="N",
-                          help="of the first weights, the order of pairs and the augmentation (default: 0)")
-    training.add_argument("--device", **device)
-    run = t.add_argument_group("run")
-    run.add_argument("--out", metavar="RUN", help="folder of the run (default: runs/TIME)")
-    run.add_argument("--resume", action="store_true", help="go on with the training in --out, with the options it was begun with")
+    add = t.add_argument_group("network").add_argument
+    add("--weights", metavar="FILE|RUN", help="begin from these weights, with their network, and not from random ones")
+    add("--neighbors", type=int, metavar="N", help=f"n_n of the first set abstraction, Table 2 (default: {Config.sa1.n_n})")
+    add("--no-plane", action="store_false", dest="plane", help="leave out the points of the ground plane, Table 2")
+    add = t.add_argument_group("training").add_argument
+    add("--short", action="store_true", help="fewer epochs, one-cycle learning rate, Muon, augmentation (always without --data)")
+    add("--epochs", type=int, metavar="N", help=f"default: {Config.epochs}, short {SHORT['epochs']}")
+    add("--batch", type=int, metavar="N", help=f"pairs in a batch, each both ways (default: {Config.batch}, short {SHORT['batch']})")
+    add("--lr", type=float, metavar="X", help=f"learning rate, at its highest (default: {Config.lr}, short {SHORT['lr']})")
+    add("--seed", type=number, metavar="N", help="of the first weights, the order of pairs and the augmentation (default: 0)")
+    add("--device", help="cpu, cuda or mps (default: cpu)")
+    add = t.add_argument_group("run").add_argument
+    add("--out", metavar="RUN", help="folder of the run (default: runs/TIME)")
+    add("--resume", action="store_true", help="go on with the training in --out, with the options it was begun with")
 
-    network = e.add_argument_group("network")
-    network.add_argument("--weights", metavar="FILE|RUN", help="weights, or folder of a run (default: those shipped)")
-    network.add_argument("--refine", type=number, default=0, metavar="N", help=(
+    add = e.add_argument_group("network").add_argument
+    add("--weights", metavar="FILE|RUN", help="weights, or folder of a run (default: those shipped)")
+    add("--refine", type=number, metavar="N", help=(
         "not in the paper: average both directions, and apply the network N more times to what is left (default: 0, the plain answer)"))
-    network.add_argument("--device", **device)
-    results = e.add_argument_group("results")
-    results.add_argument("--out", metavar="DIR", help="folder for NN.txt and results.json (default: results/TIME)")
-    results.add_argument("--plot", action="store_true", help="draw the paths and the errors by length; needs matplotlib")
-    return parser, t
+    add("--device", help="cpu, cuda or mps (default: cpu)")
+    add = e.add_argument_group("results").add_argument
+    add("--out", metavar="DIR", help="folder for NN.txt and results.json (default: results/TIME)")
+    add("--plot", action="store_true", help="draw the paths and the errors by length; needs matplotlib")
+    return parser
 
 
 def config_from(args):
     """The Config that `train` was asked for; its options are taken out of args, the rest is what the function takes."""
-    if args["weights"] and (args["neighbors"] or not args["plane"]):
+    if "weights" in args and args.keys() & {"neighbors", "plane"}:
         raise ValueError("--weights brings its network along; leave out --neighbors and --no-plane")
-    config = Config(**(SHORT if args.pop("short") or not args["data"] else {}), plane=args.pop("plane"))
-    given = {name: args.pop(name) for name in ("epochs", "batch", "lr")}
-    n_n = args.pop("neighbors") or config.sa1.n_n
-    return replace(config, sa1=config.sa1._replace(n_n=n_n), **{name: x for name, x in given.items() if x is not None})
+    recipe = SHORT if args.pop("short", not args.get("data")) else {}
+    given = {name: args.pop(name) for name in ("epochs", "batch", "lr", "plane") if name in args}
+    return Config(**recipe | given, sa1=Config.sa1._replace(n_n=args.pop("neighbors", Config.sa1.n_n)))
 
 
 def main(argv=None):
     """The command line -> exit code: 0, 2 for bad input, 130 when interrupted."""
-    parser, t = command_line()
-    args = vars(parser.parse_args(argv))
+    args = vars(command_line().parse_args(argv))
     keep_freed_memory()
     kitti.terminate_as_interrupted()
     try:
         if args.pop("command") == "eval":
             evaluate(**args)
+        elif "resume" in args and args.keys() - {"resume", "out", "device"}:
+            raise ValueError("--resume goes on with the options the run was begun with; give only --out RUN, and --device")
         else:
-            if args["resume"] and any(args[k] != t.get_default(k) for k in args.keys() - {"resume", "out", "device"}):
-                raise ValueError("--resume goes on with the options the run was begun with; give only --out RUN, and --device")
             train(config_from(args), **args)
     except KeyboardInterrupt as interruption:
         print(f"\nd3dlo: interrupted; {str(interruption) or 'run it again; a training goes on by train --out RUN --resume'}", file=sys.stderr)
