@@ -16,7 +16,7 @@ B pairs of scans, C clouds (scans) in a batch, D features.
     python d3dlo.py train --data ROOT           # KITTI odometry, the paper's schedule
     python d3dlo.py eval --data ROOT            # with the weights beside this file
 """
-import argparse, ctypes, hashlib, itertools, json, math, platform, signal, subprocess, sys, threading, time, warnings, zipfile, zlib
+import argparse, ctypes, hashlib, itertools, json, math, platform, shutil, signal, subprocess, sys, threading, time, warnings, zipfile, zlib
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -1065,19 +1065,12 @@ def keep_freed_memory():
         pass
 
 
-def revision():
-    """Git's name for the state of this code, None when it does not lie in a repository of its own."""
-    here = Path(__file__).resolve().parent
-    try:
-        git = subprocess.run(["git", "-C", here, "describe", "--always", "--dirty"], capture_output=True, text=True)
-        return git.stdout.strip() if (here / ".git").exists() else None
-    except OSError:                                     # no git
-        return None
-
-
 def note_beginning(run, arguments, config, fingerprints):
     """RUN/config.json: all that is needed to repeat a training, or to go on with it."""
-    versions = {"d3dlo": revision(), "python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__,
+    here = Path(__file__).resolve().parent
+    git = shutil.which("git") if (here / ".git").exists() else None            # of another repository, or none, it would not tell
+    code = git and subprocess.run([git, "-C", here, "describe", "--always", "--dirty"], capture_output=True, text=True).stdout.strip()
+    versions = {"d3dlo": code, "python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__,
                 "torch": torch.__version__}
     begun = dict(arguments=arguments, config=config.as_dict(), versions=versions, fingerprints=fingerprints)
     with metrics.replacing(run / "config.json") as temporary:
