@@ -614,13 +614,6 @@ def answer(net, clouds, p, q, device):
     return from_output(y, net.config)
 
 
-def both_ways(net, clouds, device):
-    """(2n,) records, the Ps and then the Qs -> T_pq (n,4,4), half-way between the answer for (P, Q) and the inverse of that for (Q, P)."""
-    p, q = np.arange(len(clouds)).reshape(2, -1)
-    T, T_back = np.split(answer(net, clouds, np.concatenate([p, q]), np.concatenate([q, p]), device), 2)
-    return T @ from_vector(to_vector(invert(T) @ invert(T_back)) / 2)
-
-
 @torch.inference_mode()
 def predict_motions(net, records, device="cpu", batch=16, refine=0):
     """(n,) records of consecutive scans -> (n-1,4,4) T_{t,t+1}, Velodyne frame, one forward pass a pair.
@@ -630,13 +623,14 @@ def predict_motions(net, records, device="cpu", batch=16, refine=0):
     out = []
     for i in range(0, len(records) - 1, batch):
         clouds = records[i:i + batch + 1]
+        n = len(clouds) - 1
+        p, q, T = np.arange(n), np.arange(n) + n, np.tile(np.eye(4), (n, 1, 1))
         if refine:
-            P, Q = clouds[:-1], clouds[1:]
-            T = both_ways(net, np.concatenate([P, Q]), device)
-            for _ in range(refine):
-                T = both_ways(net, np.concatenate([P, moved(Q, T)]), device) @ T
+            for _ in range(1 + refine):
+                pairs = np.concatenate([clouds[:-1], moved(clouds[1:], T)])                    # (2n,): the Ps, and then the Qs
+                T_pq, T_qp = np.split(answer(net, pairs, np.r_[p, q], np.r_[q, p], device), 2)
+                T = T_pq @ from_vector(to_vector(invert(T_pq) @ invert(T_qp)) / 2) @ T         # half-way between the two, after T
         else:
-            p = np.arange(len(clouds) - 1)
             T = answer(net, clouds, p, p + 1, device)
         out.append(T)
     return np.concatenate(out) if out else np.empty((0, 4, 4))
