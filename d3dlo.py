@@ -901,15 +901,9 @@ def zip_for_server(out, names):
     return f"\nto submit     {out}/kitti-server.zip"
 
 
-def evaluate_network(net, state, sequences, geometry, out, source, device="cpu", refine=0):
-    """`run_network` over sequences, write OUT/results.json (with `source`), return the table. Rows whose data the weights were trained
-    on are marked, by the data's fingerprint and not by name."""
-    out = Path(out)
-    errors = {s.name: run_network(net, state, s, records, out, device, refine)
-              for s, records in progress(zip(sequences, geometry), len(sequences), "registering, sequences")}
-    seen = {*state["train"].values(), *state["before"]}
-    trained_on = {s.name: fingerprint(s) in seen for s in sequences}
-
+def report(errors, trained_on, out, source):
+    """{sequence: what `run_network` gave}, {sequence: whether the weights were trained on its data} -> the table, in which those are
+    marked; with `source` written to OUT/results.json."""
     def summary(names, predictor="network"):
         some = [errors[name][predictor] for name in names if errors[name]]
         return metrics.summary([e for e, _ in some], [e for _, e in some]) | {"trained_on": any(trained_on[n] for n in names)}
@@ -993,8 +987,8 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
         raise ValueError(f"{checkpoint}: holds weights, but no training to go on with")
     if state and state["train"] != digests:
         raise ValueError(f"{checkpoint}: was trained on other data than lies there now; resume with the data it was begun with")
-    geometry = load_geometry(chosen + held_out, config)
-    remember = remembered(digests, motions, geometry[:len(chosen)], before)
+    geometry = load_geometry(chosen + held_out, config)[:len(chosen)]           # of all, so that a scan held out that is broken is met now
+    remember = remembered(digests, motions, geometry, before)
     note_beginning(run, dict(data=data, sequences=names, seed=seed, device=device, weights=weights), config, digests)
 
     def say(line):
@@ -1010,16 +1004,15 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
         f"{config.epochs} epochs of {steps_per_epoch(motions, config)} batches -> {run}\nloss: eq. 2, metres and degrees alike")
     if not sequences and (gone := set(SPLITS["train"]) - set(names)):
         say(f"of the training split {' '.join(sorted(gone))} are not there")
-    net = fit(net, geometry[:len(chosen)], motions, run, seed, device, state, say, **remember)
+    fit(net, geometry, motions, run, seed, device, state, say, **remember)
     if held_out:
-        source = {"weights": str(run / "weights.pt"), "data": str(root)}
-        say(evaluate_network(net, remember, held_out, geometry[len(chosen):], run / "results", source, device))
+        evaluate(root, run, [s.name for s in held_out], run / "results", device, say=say)
     say(f"weights       {run}/weights.pt\nnext          python d3dlo.py eval --weights {run}" + (f" --data {data}" if data else ""))
     return run
 
 
-def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", refine=0, plot=False):
-    """The command `eval`: print the table of `weights` (None: shipped) on `sequences` of `data` (None: the simulated test and
+def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", refine=0, plot=False, say=print):
+    """The command `eval`: say the table of `weights` (None: shipped) on `sequences` of `data` (None: the simulated test and
     validation sequences). Returns the folder with trajectories and figures. ValueError, FileNotFoundError."""
     check_device(device)
     net, state = load_weights(weights, device)
@@ -1032,11 +1025,14 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     for s in chosen:
         if s.poses is None and (s.folder / "poses.txt").exists():
             print(f"{s.folder}/poses.txt: SemanticKITTI's, estimated by SuMa; not used, it is no ground truth", file=sys.stderr)
-    source = {"weights": str(weights or WEIGHTS), "data": str(root), "refine": refine}
-    print(evaluate_network(net, state, chosen, load_geometry(chosen, net.config), out, source, device, refine))
+    work = progress(zip(chosen, load_geometry(chosen, net.config)), len(chosen), "registering, sequences")
+    errors = {s.name: run_network(net, state, s, records, out, device, refine) for s, records in work}
+    seen = {*state["train"].values(), *state["before"]}        # fingerprints: another sequence may have the same name
+    trained_on = {s.name: fingerprint(s) in seen for s in chosen}
+    say(report(errors, trained_on, out, {"weights": str(weights or WEIGHTS), "data": str(root), "refine": refine}))
     if plot:
         metrics.draw(out / "plot.png", {s.name: (s.poses_cam, metrics.read_poses(out / f"{s.name}.txt")) for s in chosen})
-        print(f"picture       {out}/plot.png (from above in the camera's frame, errors by length)")
+        say(f"picture       {out}/plot.png (from above in the camera's frame, errors by length)")
     return out
 
 
