@@ -16,7 +16,7 @@ B pairs of scans, C clouds (scans) in a batch, D features.
     python d3dlo.py train --data ROOT           # KITTI odometry, the paper's schedule
     python d3dlo.py eval --data ROOT            # with the weights beside this file
 """
-import argparse, ctypes, hashlib, itertools, json, math, platform, shutil, signal, subprocess, sys, threading, time, warnings, zipfile, zlib
+import argparse, copy, ctypes, hashlib, itertools, json, math, platform, shutil, signal, subprocess, sys, threading, time, warnings, zipfile, zlib
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -824,8 +824,6 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
         step, losses = resume["step"], resume["losses"]
         for name, part in parts.items():
             part.load_state_dict(resume[name])
-    usable = D3DLO(config).to(device)
-
     enough = min(25, total)     # batches for the statistics, and to compare both modes on
 
     def fixed_batches():        # drawn like those of the training, by random numbers of their own
@@ -836,10 +834,10 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
              **{name: part.state_dict() for name, part in parts.items()})
 
     def store_weights():
-        usable.load_state_dict(net.state_dict())
+        usable = copy.deepcopy(net)
         loss = recompute_statistics(usable, fixed_batches(), objective)
         save(run / "weights.pt", config=config.as_dict(), step=step, **remember, model=usable.state_dict())
-        return loss
+        return usable, loss
 
     stored = time.monotonic()
     todo = batches(geometry, motions, config, (seed,), step, total, device)
@@ -860,7 +858,7 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
         store_checkpoint()
         if came:
             raise KeyboardInterrupt(f"step {step} is stored; python d3dlo.py train --out {run} --resume goes on from it")
-    loss_train = store_weights()
+    usable, loss_train = store_weights()
     loss_eval = mean_loss(usable.eval(), fixed_batches(), objective)
     say(f"loss over {enough} batches, weights fixed: {loss_train:.4f} in train mode, {loss_eval:.4f} in eval mode")
     return usable
