@@ -888,17 +888,6 @@ def run_network(net, state, s, records, out, device="cpu", refine=0):
     return errors
 
 
-def zip_for_server(out, names):
-    """OUT/kitti-server.zip as KITTI's server wants it, when its eleven sequences without ground truth are among the names."""
-    server = [str(i) for i in range(11, 22)]
-    if not set(server) <= set(names):
-        return ""
-    with metrics.replacing(out / "kitti-server.zip") as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name in server:                                     # in its root, as the devkit's readme wants them
-            archive.write(out / f"{name}.txt", f"{name}.txt")
-    return f"\nto submit     {out}/kitti-server.zip"
-
-
 def report(errors, trained_on, out, source):
     """{sequence: what `run_network` gave}, {sequence: whether the weights were trained on its data} -> the table, in which those are
     marked; with `source` written to OUT/results.json."""
@@ -921,8 +910,7 @@ def report(errors, trained_on, out, source):
     rows += [metrics.row(length, s) for length, s in lengths.items()]
     return (metrics.table(metrics.HEADER, rows) + "\n*: trained on. E_t, E_r: KITTI's segments of 100 to 800 m, rectified left camera "
             "frame. t step, r step: mean length and\nangle of inv(T_est) @ T_true of a step, Velodyne frame. -: no such segment, or no "
-            f"ground truth.\ntrajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)\nfigures       {out}/results.json"
-            + zip_for_server(out, errors))
+            f"ground truth.\ntrajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)\nfigures       {out}/results.json")
 
 
 # ------------------------------------------------------------------------------------------------------------- command line
@@ -1028,6 +1016,12 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     seen = {*state["train"].values(), *state["before"]}        # fingerprints: another sequence may have the same name
     trained_on = {s.name: fingerprint(s) in seen for s in chosen}
     say(report(errors, trained_on, out, {"weights": str(weights or WEIGHTS), "data": str(root), "refine": refine}))
+    server = [str(i) for i in range(11, 22)]                    # KITTI's sequences without ground truth
+    if set(server) <= set(errors):
+        with metrics.replacing(out / "kitti-server.zip") as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name in server:                                 # in its root, as the devkit's readme wants them
+                archive.write(out / f"{name}.txt", f"{name}.txt")
+        say(f"to submit     {out}/kitti-server.zip")
     if plot:
         metrics.draw(out / "plot.png", {s.name: (s.poses_cam, metrics.read_poses(out / f"{s.name}.txt")) for s in chosen})
         say(f"picture       {out}/plot.png (from above in the camera's frame, errors by length)")
