@@ -790,17 +790,6 @@ def interruption_waits():
             signal.signal(number, handler)
 
 
-def training_step(objective, net, batch, target, minimizers):
-    """Loss of a batch, after which `minimizers`, the optimisers and their schedules, go one step on. Returns it, and the learning rate."""
-    loss, rate = objective(net.train()(batch), target), minimizers[0].param_groups[0]["lr"]
-    net.zero_grad()
-    objective.zero_grad()
-    loss.backward()
-    for part in minimizers:
-        part.step()
-    return loss.item(), rate
-
-
 def parts_of(net, steps, device="cpu"):
     """All that a training of so many steps changes, which is what a checkpoint holds: {name: network, objective, optimisers, schedules}."""
     objective = Objective(net.config).to(device)
@@ -818,7 +807,7 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
     config, per_epoch, run = net.config, steps_per_epoch(motions, net.config), Path(run)
     total = config.epochs * per_epoch
     parts = parts_of(net, total, device)
-    _, objective, *minimizers = parts.values()
+    _, objective, *minimizers = parts.values()              # the last are the optimisers and their schedules
     step, losses = 0, []
     if resume:
         step, losses = resume["step"], resume["losses"]
@@ -843,9 +832,14 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
     todo = batches(geometry, motions, config, (seed,), step, total, device)
     with interruption_waits() as came:
         for batch, target in progress(todo, total - step, f"training, batches of {config.batch} pairs, swap: {config.swap}"):
-            loss, rate = training_step(objective, net, batch, target, minimizers)
+            loss, rate = objective(net.train()(batch), target), minimizers[0].param_groups[0]["lr"]
+            net.zero_grad()
+            objective.zero_grad()
+            loss.backward()
+            for minimizer in minimizers:
+                minimizer.step()
             step += 1
-            losses.append(loss)
+            losses.append(loss.item())
             if step % per_epoch == 0:
                 say(f"epoch {step // per_epoch}/{config.epochs}: loss {np.mean(losses):.4f}, learning rate {rate:.1e}")
                 losses = []
