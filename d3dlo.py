@@ -1,12 +1,10 @@
 """D3DLO: Deep 3D LiDAR Odometry (Adis, Horst, Wien; ICIP 2021)
 
-In the paper's order: Table 1; problem and objective (3.1, 3.2); the network (3.3), sampling and grouping (3.3.2, 3.3.3) before the layers
-that use them; what the paper tried and left (3.2, 3.4); poses from scans (eq. 1); training (4); evaluation (5).
-
 Two LiDAR scans in, the motion between them out: set abstraction on each scan, a flow embedding between them, two more set
 abstractions, a mini-PointNet, an MLP; 61,290 parameters. Sampling and grouping depend on no weight, so they are NumPy: those
 of a scan are computed once and cached, only the neighbours between two scans are found for each pair. What is learned is torch.
-The vector of section 3.2 and the plane of section 4 are in kitti.py, section 5's E_t and E_r in metrics.py.
+The file follows the paper, but sampling and grouping (3.3.2, 3.3.3) come before the layers that use them. The vector of section 3.2
+and the plane of section 4 are in kitti.py, section 5's E_t and E_r in metrics.py.
 
 Frame: Velodyne, x forward, y left, z up, metres. `T_ab` maps points of frame b into frame a. A motion is T_{t,t+1} (eq. 1), as
 a vector [tx, ty, tz] in metres and [roll, pitch, yaw] in degrees. Shapes: N points of a scan, S centroids, k neighbours of each,
@@ -536,8 +534,7 @@ class D3DLO(nn.Module):
 # ------------------------------------------------------------- sections 3.4, 3.2: what the paper tried beside eq. 2, off by default
 
 def cosine_distance(y_hat, y):
-    """Eq. 5, the mean over a batch: (B,D), (B,D) -> (). The small number gives standing still the value 1, not NaN, and tells for motions
-    of millimetres."""
+    """Eq. 5, mean over a batch: (B,D), (B,D) -> (). The small number makes standing still 1, not NaN, and tells for motions of mm."""
     return (1 - (y * y_hat).sum(1) * torch.rsqrt((y.square().sum(1) + 1e-6) * (y_hat.square().sum(1) + 1e-6))).mean()
 
 
@@ -683,8 +680,7 @@ def augment(clouds, T_pq, rng):
 
 
 def training_batch(geometry, motions, pairs, config, rng, device="cpu"):
-    """Pairs (n,2) of (sequence, scan) -> Batch and targets (B,6), see `to_output`. One direction is (P, Q) with T, the other (Q, P)
-    with T^-1."""
+    """Pairs (n,2) of (sequence, scan) -> Batch and targets (B,6), see `to_output`: of (P, Q) T, and of (Q, P) T^-1."""
     clouds = np.stack([geometry[s][i + d] for d in (0, 1) for s, i in pairs])                  # (2n,): all P, all Q
     T_pq = np.stack([motions[s][i] for s, i in pairs])                                         # (n,4,4)
     if config.augment:
@@ -864,8 +860,7 @@ PREDICTORS = "network", "standing still", "mean motion of training"        # the
 
 
 def run_network(net, state, s, records, out, device="cpu", refine=0):
-    """Run the network over a sequence and write OUT/NN.txt, a KITTI pose file -> {predictor: (segment errors, step errors)}, empty
-    without ground truth. `refine`: see `predict_motions`."""
+    """Register a sequence and write OUT/NN.txt, a KITTI pose file -> {predictor: (segment, step errors)}, empty without ground truth."""
     strange = [words for words in (unlike(looks, state["seen"]) for looks in records["looks"]) if words]
     if strange:
         print(f"sequence {s.name}: {len(strange)} of {len(s)} scans are unlike those the weights were trained on, do not trust the answer: "
@@ -910,14 +905,12 @@ def report(errors, trained_on, out, source):
 # ------------------------------------------------------------------------------------------------------------- command line
 
 def data_root(data, names, whole=False):
-    """The folder `data`, or if None that of the simulated city, of which the sequences named, or the `whole`, are made where missing.
-    ValueError for a name it does not know."""
+    """`data`, or if None the simulated city, of which the sequences named, or the `whole`, are made. ValueError for a name unknown."""
     names = [names] if isinstance(names, str) else names or ()
     if data:
         return Path(data)
     if strange := set(names) - {"all", *SPLITS, *sum(SPLITS.values(), ())}:
-        raise ValueError(f"the simulated city has no sequence {' '.join(sorted(strange))}: there are 00 to 10, the splits {', '.join(SPLITS)}, "
-                         "and all")
+        raise ValueError(f"the simulated city has no sequence {' '.join(sorted(strange))}: there are 00 to 10, {', '.join(SPLITS)}, and all")
     return kitti.simulate(SIMULATED, sequences="all" if whole else names)
 
 
