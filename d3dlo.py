@@ -742,13 +742,12 @@ def schedule(optimizer, config, steps):
 def recompute_statistics(net, examples, objective=loss_unweighted):
     """BatchNorm's running averages lag behind the weights; replace them by the plain mean over these examples (Batch,
     target), weights fixed. Returns the mean loss over them in training mode."""
-    norms = [m for m in net.modules() if isinstance(m, nn.modules.batchnorm._BatchNorm)]
-    momenta = [norm.momentum for norm in norms]
-    for norm in norms:
+    momenta = {m: m.momentum for m in net.modules() if isinstance(m, nn.modules.batchnorm._BatchNorm)}
+    for norm in momenta:
         norm.reset_running_stats()
         norm.momentum = None
     loss = mean_loss(net.train(), examples, objective)
-    for norm, momentum in zip(norms, momenta):
+    for norm, momentum in momenta.items():
         norm.momentum = momentum
     return loss
 
