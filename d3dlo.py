@@ -105,8 +105,7 @@ class Config:
         return json.loads(json.dumps(asdict(self)))
 
 
-# the 10-minute training on the simulated city
-SHORT = dict(epochs=9, batch=8, optimizer="muon", lr=1e-2, schedule="one-cycle", augment=True)
+SHORT = dict(epochs=9, batch=8, optimizer="muon", lr=1e-2, schedule="one-cycle", augment=True)         # in 10 minutes on the simulated city
 
 
 # ------------------------------------------------------------------------------------ sections 3.1, 3.2: problem and objective
@@ -211,6 +210,7 @@ def group_knn(xyz: np.ndarray, query: np.ndarray, k: int) -> np.ndarray:
     return np.where(idx == len(xyz), idx[:, :1], idx)
 
 
+GEOMETRY = 3    # raise when scan_geometry changes, so that older caches are not read
 # what tells one kind of scans from another, to say when weights meet a kind they were not trained on
 LOOKS = "usable points", "mean intensity", "median range of the centroids [m]", "share of points in the fullest 0.3 m of height, the ground"
 
@@ -226,9 +226,6 @@ def geometry_dtype(config):
                      ("dropped", "i4"),                 # points left out that no sensor gives: not finite, or of absurd intensity
                      ("looks", "f4", len(LOOKS)),
                      ("crc", "u4")])                    # of all the bytes before
-
-
-GEOMETRY = 3    # raise when scan_geometry changes, so that older caches are not read
 
 
 def scan_geometry(scan: np.ndarray, config: Config = Config()) -> np.ndarray:
