@@ -18,7 +18,6 @@ import argparse, copy, ctypes, hashlib, itertools, json, math, platform, shutil,
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -319,7 +318,7 @@ def load_geometry(sequences, config, cache="cache"):
         paths = [path for s, _ in missing for path in s.scan_paths]
         pool = ProcessPoolExecutor(kitti.cores(), initializer=kitti.worker_starts)
         try:
-            records = pool.map(partial(_geometry_of_file, config=config), paths, chunksize=4)
+            records = pool.map(_geometry_of_file, paths, itertools.repeat(config), chunksize=4)
             records = progress(records, len(paths), "sampling and grouping, scans")
             for s, file in missing:
                 shape = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": (len(s),)}
