@@ -156,8 +156,7 @@ def farthest_point_sampling(xyz: np.ndarray, n: int, start: int = 0) -> np.ndarr
 
     Ties go to the lowest index (so picks repeat when fewer than n points differ). Nested: the first m picks are what n = m gives.
     The cloud is cut into chunks of neighbours. A pick can shorten distances only in chunks whose bounding box is nearer to it than
-    the chunk's largest distance left; all others are skipped. ValueError when there are fewer than n points.
-    """
+    the chunk's largest distance left; all others are skipped. ValueError when there are fewer than n points."""
     xyz = np.asarray(xyz)
     if not (0 < n <= len(xyz) and 0 <= start < len(xyz)):
         raise ValueError(f"farthest point sampling of {n} among {len(xyz)} points from {start}: n must be 1 to {len(xyz)}, start below that")
@@ -193,8 +192,7 @@ def group_ball(xyz: np.ndarray, centroids: np.ndarray, r: float, n_n: int, tree:
 
     The first is the centroid (or a point in the same place). Where there are fewer, the missing slots hold the centroid's own
     index (section 3.3.2, of an empty ball). That changes no maximum, though it counts in BatchNorm's statistics, and it is common: on
-    real scans 10 to 18 % of SA1's balls have fewer than 8 points. `tree`, a cKDTree of xyz, saves building one.
-    """
+    real scans 10 to 18 % of SA1's balls have fewer than 8 points. `tree`, a cKDTree of xyz, saves building one."""
     # ranks as a list: for the number 1 scipy would drop the axis
     _, idx = (tree or cKDTree(xyz)).query(xyz[centroids], [*range(1, spread * n_n + 1)], distance_upper_bound=np.nextafter(r, np.inf))
     size = (idx < len(xyz)).sum(1, keepdims=True)                                              # (S,1); scipy marks a missing one by N
@@ -304,8 +302,7 @@ def load_geometry(sequences, config, cache="cache"):
     """List of `Sequence` -> list of (n,) arrays of records, memory-mapped from files that are made where there are none yet.
 
     A file's name is a digest of the data and settings it depends on, so a stale one is never read, and it is moved into place
-    when complete, so two runs may share a cache. Scans are shared out over the cores. ValueError for a scan with too few points.
-    """
+    when complete, so two runs may share a cache. Scans are shared out over the cores. ValueError for a scan with too few points."""
     dtype = geometry_dtype(config)
     files = []
     for s in sequences:
@@ -418,8 +415,7 @@ def linear_norm_relu_max(linear, norm, h):
 
     ReLU is increasing and BN increasing or decreasing with the sign of its scale, so the maximum is taken first: of z where that
     is positive, of -z where it is negative. BN's statistics are still those of all neighbours; they follow from h's:
-    mean = W E[h] + b, var = diag(W Cov[h] W^T).
-    """
+    mean = W E[h] + b, var = diag(W Cov[h] W^T)."""
     sign = torch.where(norm.weight < 0, -1.0, 1.0)
     W, b = sign[:, None] * linear.weight, sign * linear.bias
     z, first, second = LinearMax.apply(h, W, norm.training)                                    # (B,S,D'), (D,), (D,D)
@@ -463,8 +459,7 @@ class SetAbstraction(nn.Module):
 
     The first linear layer acts on a concatenation, so it is applied to each point before gathering, W [x_i - x'_j, f_i] + b =
     (W_x x_i + W_f f_i) + (b - W_x x'_j): the same parameters and function at a fraction of the memory traffic. (The order, x before f, is
-    ours. SA1's neighbours come gathered from the cache, so of it only `h` is called.)
-    """
+    ours. SA1's neighbours come gathered from the cache, so of it only `h` is called.)"""
 
     def __init__(self, d_in, layer):
         super().__init__()
