@@ -6,12 +6,7 @@ leaderboard: E_t in percent, E_r in degrees per metre.
 
     python metrics.py GT EST           # two pose files, or two folders of NN.txt
 """
-import argparse
-import glob
-import os
-import platform
-import shutil
-import sys
+import argparse, glob, os, platform, shutil, sys
 from contextlib import contextmanager
 from pathlib import Path
 
