@@ -19,18 +19,14 @@ SEGMENT = np.dtype([("first", int), ("last", int), ("length", float), ("t_err", 
 
 def temporary_beside(path):
     """A path beside `path` for this process to write to. What processes of this machine that are no more left there is removed."""
-    def runs(pid):
+    prefix = f".{path.name}.{platform.node()}."
+    for left in path.parent.glob(glob.escape(prefix) + "*") if os.name == "posix" else ():      # elsewhere signal 0 is no question
         try:
-            os.kill(int(pid), 0)
-        except (ProcessLookupError, OverflowError):
-            return False
+            os.kill(int(left.name[len(prefix):]), 0)
+        except (ProcessLookupError, OverflowError):         # it runs no more
+            shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
         except (PermissionError, ValueError):               # another user's; not ours at all
             pass
-        return True
-    prefix = f".{path.name}.{platform.node()}."
-    for left in path.parent.glob(glob.escape(prefix) + "*"):
-        if os.name == "posix" and not runs(left.name[len(prefix):]):        # elsewhere signal 0 is no question
-            shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
     return path.with_name(prefix + str(os.getpid()))
 
 
