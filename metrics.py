@@ -48,21 +48,17 @@ def read_poses(path: str | Path) -> np.ndarray:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such pose file")
-    rows = []
-    for number, line in enumerate(path.read_bytes().splitlines(), 1):
-        if not line.strip():
-            continue
-        try:
-            row = np.array(line.split(), float)
-        except ValueError:
-            raise ValueError(f"{path}, line {number}: not a row of numbers; a KITTI pose file has 12 a row") from None
-        if len(row) != 12 or not np.isfinite(row).all():
-            raise ValueError(f"{path}, line {number}: {np.isfinite(row).sum()} finite numbers of {len(row)}, a KITTI pose has 12")
-        rows.append(row)
+    rows = [(number, line.split()) for number, line in enumerate(path.read_bytes().splitlines(), 1) if line.strip()]
     if not rows:
         raise ValueError(f"{path}: holds no pose")
     T = np.tile(np.eye(4), (len(rows), 1, 1))                                       # (n,4,4)
-    T[:, :3] = np.reshape(rows, (-1, 3, 4))
+    for pose, (number, words) in zip(T, rows):
+        try:
+            pose[:3] = np.array(words, float).reshape(3, 4)
+        except ValueError:
+            pose[:] = np.nan
+        if not np.isfinite(pose).all():
+            raise ValueError(f"{path}, line {number}: {len(words)} words, but a KITTI pose is 12 finite numbers")
     R = T[:, :3, :3]
     with np.errstate(all="ignore"):                         # of absurd numbers
         rigid = (np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) < 1e-2) & (np.linalg.det(R) > 0)
