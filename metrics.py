@@ -4,7 +4,8 @@ A trajectory is an array (n,4,4): T_0i maps points of frame i into frame 0. In K
 left camera of scan i. The numbers are those of the KITTI devkit (devkit/cpp/evaluate_odometry.cpp), in the units of its
 leaderboard: E_t in percent, E_r in degrees per metre.
 
-    python metrics.py GT EST           # two pose files, or two folders of NN.txt
+    python metrics.py poses/00.txt results/00.txt
+    python metrics.py poses results --plot results/plot.png
 """
 import argparse, glob, os, platform, shutil, sys
 from contextlib import contextmanager
@@ -212,9 +213,7 @@ def _pairs_of_files(gt, est):
 
 def main(argv=None):
     """The command line -> exit code."""
-    parser = argparse.ArgumentParser(
-        description="KITTI's odometry errors of trajectories.\n\n  python metrics.py poses/00.txt results/00.txt\n"
-        "  python metrics.py poses results --plot results/plot.png", formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("gt", metavar="GT", type=Path, help="ground truth: a pose file, or a folder of NN.txt")
     parser.add_argument("est", metavar="EST", type=Path, help="estimate: likewise")
     parser.add_argument("--plot", metavar="PNG", type=Path, help="draw the paths and the errors by length; needs matplotlib")
