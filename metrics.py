@@ -220,8 +220,6 @@ def main(argv=None):
     args = parser.parse_args(argv)
     rows, all_segments, all_steps, trajectories = [], [], [], {}
     try:
-        if args.plot:
-            picture(1, 1)                                   # say so now if it cannot be drawn
         for name, files in _pairs_of_files(args.gt, args.est).items():
             T_gt, T_est = map(read_poses, files)
             if len(T_gt) != len(T_est):
