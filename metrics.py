@@ -205,10 +205,10 @@ def _pairs_of_files(gt, est):
         raise ValueError(f"{gt} and {est}: give two pose files or two folders of NN.txt, not one of each")
     if not gt.is_dir():
         return {gt.stem: (gt, est)}
-    names = sorted(p.stem for p in est.glob("*.txt") if (gt / p.name).is_file())
-    if not names:
+    pairs = {path.stem: (gt / path.name, path) for path in sorted(est.glob("*.txt")) if (gt / path.name).is_file()}
+    if not pairs:
         raise FileNotFoundError(f"{est}: holds no NN.txt that {gt} holds as well")
-    return {name: (gt / f"{name}.txt", est / f"{name}.txt") for name in names}
+    return pairs
 
 
 def main(argv=None):
@@ -218,16 +218,16 @@ def main(argv=None):
     parser.add_argument("est", metavar="EST", type=Path, help="estimate: likewise")
     parser.add_argument("--plot", metavar="PNG", type=Path, help="draw the paths and the errors by length; needs matplotlib")
     args = parser.parse_args(argv)
-    rows, all_segments, all_steps, trajectories = [], [], [], {}
+    rows, segments, steps, trajectories = [], [], [], {}
     try:
-        for name, files in _pairs_of_files(args.gt, args.est).items():
-            T_gt, T_est = map(read_poses, files)
+        for name, (gt, est) in _pairs_of_files(args.gt, args.est).items():
+            T_gt, T_est = trajectories[name] = read_poses(gt), read_poses(est)
             if len(T_gt) != len(T_est):
-                raise ValueError(f"{files[1]}: {len(T_est)} poses, but {files[0]} has {len(T_gt)}; both must cover the same scans")
-            segments, steps, ate = segment_errors(T_gt, T_est), step_errors(T_gt, T_est), rmse(absolute_errors(T_gt, T_est))
-            rows.append(row(name, summary([segments], [steps])) + [f"{ate:.3f}", f"{rmse(steps[:, 0]):.4f}", f"{rmse(steps[:, 1]):.4f}"])
-            all_segments.append(segments), all_steps.append(steps)
-            trajectories[name] = T_gt, T_est
+                raise ValueError(f"{est}: {len(T_est)} poses, but {gt} has {len(T_gt)}; both must cover the same scans")
+            segments.append(segment_errors(T_gt, T_est))
+            steps.append(step_errors(T_gt, T_est))
+            ate, rpe_m, rpe_deg = map(rmse, (absolute_errors(T_gt, T_est), *steps[-1].T))
+            rows.append(row(name, summary(segments[-1:], steps[-1:])) + [f"{ate:.3f}", f"{rpe_m:.4f}", f"{rpe_deg:.4f}"])
         if args.plot:
             draw(args.plot, trajectories)
     except (ValueError, OSError) as error:
@@ -235,8 +235,8 @@ def main(argv=None):
         return 2
     blank = ["-"] * 3
     if len(rows) > 1:
-        rows.append(row("all", summary(all_segments, all_steps)) + blank)
-    rows += [row(length, s) + blank for length, s in by_length(all_segments).items()]
+        rows.append(row("all", summary(segments, steps)) + blank)
+    rows += [row(length, s) + blank for length, s in by_length(segments).items()]
     print(table([*HEADER, "ATE [m]", "RPE [m]", "RPE [deg]"], rows))
     print("E_t, E_r: KITTI devkit, mean over segments of 100..800 m of path. t step, r step: mean error of a step. ATE, RPE: rmse as"
           "\nevo_ape kitti / evo_rpe kitti print it without flags (no alignment, delta one frame; degrees with -r angle_deg)."
