@@ -4,7 +4,8 @@ A scan is an (N,4) float32 array x, y, z [m], intensity [0..1] in the Velodyne f
 frame b to frame a. Pose files are in KITTI's rectified left camera frame; everything this module hands out as `poses` or `motions()` is
 in the Velodyne frame, because that is what the points are in: T_velo = inv(Tr) @ T_cam @ Tr. Needs NumPy and SciPy.
 
-    python kitti.py simulate DIR        # an HDL-64E driving through 11 little cities, in KITTI's layout, with exact ground truth
+    python kitti.py simulate data/city      # an HDL-64E drives through 11 little cities, with exact ground truth: 2,620 scans, 4.2 GB
+    python kitti.py simulate data/tiny --sequences 00 07 --scans 40 --azimuth 900
 """
 import argparse, functools, json, os, re, shutil, signal, sys, threading, time, warnings, zlib
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
@@ -748,10 +749,7 @@ def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range
 
 def main(argv=None):
     """The command line -> exit code."""
-    parser = argparse.ArgumentParser(formatter_class=argparse.RawDescriptionHelpFormatter, usage="""
-  python kitti.py simulate data/city                        # 11 sequences, 2,620 scans, 4.2 GB
-  python kitti.py simulate data/tiny --sequences 00 07 --scans 40 --azimuth 900""",
-                                     description="Simulated HDL-64E drives in KITTI's odometry layout, with exact ground truth.")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("command", choices=["simulate"])
     parser.add_argument("dir", metavar="DIR", help="where to")
     parser.add_argument("--seed", type=int, metavar="N", default=0, help="another seed, other cities (default: 0)")
