@@ -767,10 +767,7 @@ def main(argv=None):
     except KeyboardInterrupt:
         print("kitti.py: interrupted; sequences that are complete stay, run the same command again for the rest.", file=sys.stderr)
         return 130
-    size = sum(os.path.getsize(path) for s in made for path in s.scan_paths)
-    v = to_vector(np.concatenate([s.motions() for s in made]))  # (n,6)
-    print(f"{args.dir}: {len(made)} sequences, {sum(map(len, made)):,} scans, {size / 1e9:.2f} GB"
-          + (f", mean step {np.linalg.norm(v[:, :3], axis=1).mean():.2f} m, yaw per step +-{v[:, 5].std():.2f} deg" if len(v) else ""))
+    print(f"{args.dir}: {len(made)} sequences, {sum(map(len, made)):,} scans")
     return 0
 
 
