@@ -28,7 +28,7 @@ def _read(path, advice):
         return Path(path).read_bytes()
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} does not exist: {advice}.") from None
-    except (IsADirectoryError, PermissionError) as error:
+    except OSError as error:
         raise ValueError(f"{path} cannot be read ({error.strerror}): {advice}.") from None
 
 
@@ -191,8 +191,7 @@ def open_sequences(root: str | Path, names: str | list[str] | None = None) -> li
                                  "name sequences that are there.")
             chosen += [n for n in SPLITS[name] if n in there]
         else:
-            _check_name(name)
-            raise ValueError(f"{root} has no sequence '{name}': there are {' '.join(there)}, the splits {', '.join(SPLITS)}, and 'all'.")
+            raise ValueError(f"{root} has no sequence {name!r}: there are {' '.join(there)}, the splits {', '.join(SPLITS)}, and 'all'.")
     return [Sequence(root, name) for name in dict.fromkeys(chosen)]
 
 
