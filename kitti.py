@@ -34,8 +34,7 @@ def _read(path, advice):
 
 def _check_scan_size(path, size):
     if size == 0 or size % 16:
-        raise ValueError(f"{path} {f'has {size} bytes, no multiple of 16 (four float32 a point)' if size else 'is empty'}: "
-                         "it is no whole KITTI scan, copy or unpack it again.")
+        raise ValueError(f"{path} has {size} bytes, but a KITTI scan has 16 (four float32) for each of its points: copy or unpack it again.")
 
 
 def read_scan(path: str | Path) -> np.ndarray:
