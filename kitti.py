@@ -10,7 +10,6 @@ in the Velodyne frame, because that is what the points are in: T_velo = inv(Tr) 
 import argparse, functools, json, os, re, shutil, signal, sys, threading, time, warnings, zlib
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
@@ -477,26 +476,23 @@ def _world(name, seed, scans):
     return _uphill(T, hills), T, prisms, moving, ground, hills
 
 
-class _Rays(NamedTuple):
-    """The rays of a scan, numbered by beam, the top one first, and by azimuth *in the world*, so that a column of rays is one line in plan."""
-    a0: float; step: float  # azimuth of the first column, and from one to the next [rad]
-    cos_a: np.ndarray; sin_a: np.ndarray  # (A,) of the columns
-    tilt: np.ndarray; gain: np.ndarray  # (A,): the ray of beam e at elevation w has sin e = gain sin(w + tilt)
-    top: np.ndarray  # (A,) slope of the highest beam
-    sin_w: np.ndarray; cos_w: np.ndarray; slope: np.ndarray  # (64 A,) of all rays
+class _Rays:
+    """The rays of a scan, numbered by beam, the top one first, and by azimuth *in the world*, so that a column of rays is one line in plan.
 
+    Roll and pitch are exact: they change the elevation, in the world, of the ray that has the beam's elevation in the sensor frame and the
+    column's azimuth in the world's. With n the sensor's up in the world, sin e = n . ray = gain sin(w + tilt)."""
 
-def _rays(R, azimuth, rng):
-    """Roll and pitch are exact: they change the elevation, in the world, of the ray that has the beam's elevation in the sensor frame and the
-    column's azimuth in the world's. With n the sensor's up in the world, sin e = n . ray."""
-    f4, step = np.float32, 2 * np.pi / azimuth
-    a0 = np.arctan2(R[1, 0], R[0, 0]) + step * rng.random()
-    a = a0 + step * np.arange(azimuth)
-    along = R[0, 2] * np.cos(a) + R[1, 2] * np.sin(a)
-    cos_a, sin_a, tilt, gain = (v.astype(f4) for v in (np.cos(a), np.sin(a), np.arctan2(along, R[2, 2]), np.hypot(along, R[2, 2])))
-    w = np.arcsin(np.sin(ELEVATION[::-1]).astype(f4)[:, None] / gain) - tilt  # (64,A)
-    sin_w, cos_w = np.sin(w).ravel(), np.cos(w).ravel()
-    return _Rays(a0, step, cos_a, sin_a, tilt, gain, np.tan(w[0]), sin_w, cos_w, sin_w / cos_w)
+    def __init__(self, R, azimuth, rng):
+        self.step = 2 * np.pi / azimuth  # rad, from a column to the next
+        self.a0 = np.arctan2(R[1, 0], R[0, 0]) + self.step * rng.random()  # rad, azimuth of the first column
+        a = self.a0 + self.step * np.arange(azimuth)
+        along = R[0, 2] * np.cos(a) + R[1, 2] * np.sin(a)
+        columns = np.cos(a), np.sin(a), np.arctan2(along, R[2, 2]), np.hypot(along, R[2, 2])
+        self.cos_a, self.sin_a, self.tilt, self.gain = (v.astype(np.float32) for v in columns)  # (A,) each
+        w = np.arcsin(np.sin(ELEVATION[::-1]).astype(np.float32)[:, None] / self.gain) - self.tilt  # (64,A) elevation in the world
+        self.top = np.tan(w[0])  # (A,) slope of the highest beam
+        self.sin_w, self.cos_w = np.sin(w).ravel(), np.cos(w).ravel()
+        self.slope = self.sin_w / self.cos_w  # (64 A,) as the two before
 
 
 def _columns(p, eye, rays):
@@ -597,7 +593,7 @@ def _simulate_scan(name, seed, scans, azimuth, i):
     T, flat, prisms, moving, ground, hills = _world(name, seed, scans)
     rng = np.random.default_rng([seed, zlib.crc32(name.encode()), i])  # of the scan, so that it does not matter who makes it
     R, eye, f4 = T[i, :3, :3], flat[i, :3, 3], np.float32
-    rays = _rays(flat[i, :3, :3], azimuth, rng)
+    rays = _Rays(flat[i, :3, :3], azimuth, rng)
     met = _meet_prisms(np.concatenate([prisms, moving(i)]), eye, rays, rng)
     _meet_ground(met, ground, eye, rays)
     # returns: noise, drop-outs, intensity
