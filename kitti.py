@@ -495,27 +495,28 @@ class _Rays:
         self.slope = self.sin_w / self.cos_w  # (64 A,) as the two before
 
 
-def _columns(p, eye, rays):
-    """Every pair (prism, column of rays that may meet it): p (n,10) -> prism (P,), column (P,)."""
+def _count_from(first, count):
+    """first[i], first[i] + 1, ..., `count[i]` numbers for each i -> their i and the numbers, (sum of the counts,) each."""
+    i = np.repeat(np.arange(len(count)), count)
+    return i, np.arange(len(i)) + np.repeat(first - np.cumsum(count) + count, count)
+
+
+def _cut(p, eye, rays):
+    """Every pair (prism, column of rays that may meet it) of p (n,10): prism, column, where the column's line enters and leaves the prism
+    in plan [m], and how squarely, each (P,). A box is two slabs, a cylinder a circle."""
     dx, dy, c, s = p[:, X] - eye[0], p[:, Y] - eye[1], np.cos(p[:, YAW]), np.sin(p[:, YAW])
+    ox, oy = -(c * dx + s * dy), s * dx - c * dy  # the eye in the prism's frame
     sx, sy = np.array([[1, 1, -1, -1], [1, -1, 1, -1]])[:, None] * p[:, [HALF_X, HALF_Y]].T[:, :, None]  # (n,4) corners
     centre = np.arctan2(dy, dx)
     wide = np.arctan2(dy[:, None] + s[:, None] * sx + c[:, None] * sy, dx[:, None] + c[:, None] * sx - s[:, None] * sy) - centre[:, None]
     wide = (wide + np.pi) % (2 * np.pi) - np.pi  # of a cylinder, these are the corners of the box around it
     first = np.ceil((centre + wide.min(axis=1) - rays.a0) / rays.step).astype(int)
     last = np.floor((centre + wide.max(axis=1) - rays.a0) / rays.step).astype(int)
-    inside = (np.abs(c * dx + s * dy) < p[:, HALF_X] + 0.3) & (np.abs(s * dx - c * dy) < p[:, HALF_Y] + 0.3)
-    count = np.where(inside, 0, last - first + 1)
-    k = np.repeat(np.arange(len(p)), count)
-    return k, (np.arange(len(k)) + np.repeat(first - np.cumsum(count) + count, count)) % len(rays.cos_a)
-
-
-def _cut(p, k, col, eye, rays):
-    """Where the line of each column enters and leaves its prism in plan [m], and how squarely: a box is two slabs, a cylinder a circle."""
-    c, s = np.cos(p[:, YAW]), np.sin(p[:, YAW])
-    dx, dy = p[:, X] - eye[0], p[:, Y] - eye[1]
-    c, s, ox, oy, hx, hy, dx, dy, disc = np.stack([c, s, -(c * dx + s * dy), s * dx - c * dy, p[:, HALF_X], p[:, HALF_Y], dx, dy,
-                                                   p[:, ROUND]]).astype(np.float32)[:, k]  # ox, oy: the eye in the prism's frame
+    inside = (np.abs(ox) < p[:, HALF_X] + 0.3) & (np.abs(oy) < p[:, HALF_Y] + 0.3)
+    k, col = _count_from(first, np.where(inside, 0, last - first + 1))
+    col %= len(rays.cos_a)
+    of_prism = np.stack([c, s, ox, oy, p[:, HALF_X], p[:, HALF_Y], dx, dy, p[:, ROUND]])
+    c, s, ox, oy, hx, hy, dx, dy, disc = of_prism.astype(np.float32)[:, k]
     ca, sa, disc = rays.cos_a[col], rays.sin_a[col], disc > 0
     with np.errstate(divide="ignore", invalid="ignore"):
         ux, uy = 1 / (c * ca + s * sa), 1 / (c * sa - s * ca)
@@ -523,15 +524,14 @@ def _cut(p, k, col, eye, rays):
         middle, chord = dx * ca + dy * sa, np.sqrt(np.maximum(hx * hx - (dx * sa - dy * ca) ** 2, 0))
         enter = np.where(disc, middle - chord, np.maximum(mx - rx, my - ry))
         leave = np.where(disc, middle + chord, np.minimum(mx + rx, my + ry))
-        return enter, leave, np.where(disc, chord / hx, 1 / np.where(mx - rx > my - ry, np.abs(ux), np.abs(uy)))
+        return k, col, enter, leave, np.where(disc, chord / hx, 1 / np.where(mx - rx > my - ry, np.abs(ux), np.abs(uy)))
 
 
 def _meet_prisms(p, eye, rays, rng):
     """What each ray meets first among the prisms: (4,64 A) distance in plan (inf: nothing), cosine of incidence, albedo, fuzz."""
     f4, h = np.float32, np.float32(eye[2])
     p = p[np.hypot(p[:, X] - eye[0], p[:, Y] - eye[1]) - np.hypot(p[:, HALF_X], p[:, HALF_Y]) < CITY_RANGE]
-    k, col = _columns(p, eye, rays)
-    enter, leave, facing = _cut(p, k, col, eye, rays)
+    k, col, enter, leave, facing = _cut(p, eye, rays)
     z0, z1, fuzz = np.stack([p[:, Z0] - h, p[:, Z1] - h, p[:, FUZZ]]).astype(f4)[:, k]
     met = (enter < leave) & (enter > 0.5)
     # nothing is seen behind a prism that stops every beam of its column
@@ -543,9 +543,8 @@ def _meet_prisms(p, eye, rays, rng):
     # its candidate beams lie between its lowest and its highest visible edge; seen from above, the highest is the far edge of the roof
     beam_of = lambda m: np.searchsorted(ELEVATION, np.arcsin(np.clip(rays.gain[col] * np.sin(np.arctan(m) + rays.tilt[col]), -1, 1)))
     low, high = beam_of(z0 / np.where(z0 > 0, leave, enter)), beam_of(z1 / np.where(z1 > 0, enter, leave))
-    count = np.maximum(high - low, 0)
-    g = np.repeat(np.arange(len(k)), count)  # the pair of every candidate (pair, beam)
-    ray = (63 - np.arange(len(g)) - np.repeat(low - np.cumsum(count) + count, count)) * len(rays.cos_a) + col[g]
+    g, beam = _count_from(low, np.maximum(high - low, 0))  # the pair and the beam of every candidate
+    ray = (63 - beam) * len(rays.cos_a) + col[g]
     stops = (fuzz == 0)[g] | (rng.random(len(g), dtype=f4) > 0.3)  # light passes through foliage here and there
     g, ray = g[stops], ray[stops]
     m = rays.slope[ray]
