@@ -420,15 +420,11 @@ def _roadside(rng, at, length, odds):
         street.parked_cars()
         street.pavement()
     right.distance()
-    return _clear_of_the_road(np.concatenate(left.out + right.out), at, length)
-
-
-def _clear_of_the_road(out, at, length):
-    """Prisms (n,10) -> those that do not stand on it."""
-    road = np.concatenate([np.stack(at(np.arange(0, length, 1.0), left)[:2], axis=1) for left in (0, LANE)])  # (m,2) both lanes
-    dx, dy = road[:, 0] - out[:, X, None], road[:, 1] - out[:, Y, None]  # (n,m)
-    c, s = np.cos(out[:, YAW, None]), np.sin(out[:, YAW, None])
-    gap = np.hypot(np.maximum(np.abs(c * dx + s * dy) - out[:, HALF_X, None], 0), np.maximum(np.abs(c * dy - s * dx) - out[:, HALF_Y, None], 0))
+    out = np.concatenate(left.out + right.out)
+    lanes = np.concatenate([np.stack(at(np.arange(0, length, 1.0), left)[:2]) for left in (0, LANE)], axis=1)  # (2,m)
+    x, y, yaw, half_x, half_y = out[:, [X, Y, YAW, HALF_X, HALF_Y]].T[:, :, None]  # (n,1) each
+    dx, dy, c, s = lanes[0] - x, lanes[1] - y, np.cos(yaw), np.sin(yaw)
+    gap = np.hypot(np.maximum(np.abs(c * dx + s * dy) - half_x, 0), np.maximum(np.abs(c * dy - s * dx) - half_y, 0))  # (n,m) [m]
     return out[(gap.min(axis=1) > 1.7) | (out[:, Z0] > 2.2)]  # crowns may reach over the road
 
 
@@ -562,12 +558,6 @@ def _meet_prisms(p, eye, rays, rng):
     return out
 
 
-def _rough(x, y, z):
-    """How deep light gets into foliage, or into the windows and doors of a facade, at (x, y, z) in the world: 0 to 1, the same in every scan."""
-    a, b, c = (np.floor(v / 0.6).astype(np.int64) for v in (x, y, z))
-    return ((a * 73856093 ^ b * 19349663 ^ c * 83492791) % 1009).astype(np.float32) / 1009
-
-
 def _meet_ground(met, ground, eye, rays):
     """Fills in, where `met` of `_meet_prisms` holds nothing, what the ray meets on the ground, unless our own car is in its way."""
     d, cosine, shade, _ = met
@@ -600,7 +590,10 @@ def _simulate_scan(name, seed, scans, azimuth, i):
     d, cosine, shade, blur = met[:, ray]
     noise = lambda: rng.standard_normal(len(ray), dtype=f4)
     col = ray % azimuth
-    rough = _rough(eye[0] + d * rays.cos_a[col], eye[1] + d * rays.sin_a[col], eye[2] + d * rays.slope[ray])
+    ways = rays.cos_a[col], rays.sin_a[col], rays.slope[ray]  # for each metre in plan
+    a, b, c = (np.floor((start + d * way) / 0.6).astype(np.int64) for start, way in zip(eye, ways))  # in cells of 0.6 m of the world
+    # how deep light gets there into foliage, or into the windows and doors of a facade: 0 to 1, the same in every scan
+    rough = ((a * 73856093 ^ b * 19349663 ^ c * 83492791) % 1009).astype(f4) / 1009
     r = d / rays.cos_w[ray] + 0.02 * noise() + blur * (0.8 * rough + 0.2 * rng.random(len(ray), dtype=f4))
     lost = 0.01 + 0.10 * (r / 40) ** 2 * (0.15 / (0.05 + shade)) + 0.3 * np.exp(-cosine / 0.02) + 0.5 * np.exp(-shade / 0.03)
     light = shade * (0.65 + 0.4 * np.sqrt(cosine)) + 0.08 * noise() - 0.01 * np.maximum(r - 25, 0)  # from 60 m on KITTI's are mostly 0
