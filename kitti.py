@@ -109,11 +109,6 @@ def from_vector(v: np.ndarray) -> np.ndarray:
 
 # ------------------------------------------------------------------------------------------------------------ sequences
 
-def _check_name(name):
-    if not isinstance(name, str) or name in ("", ".", "..") or re.search(r"[/\\\0]", name):
-        raise ValueError(f"The sequence name {name!r} is no plain folder name: use the name of a folder under sequences/, such as '00'.")
-
-
 class Sequence:
     """One sequence of ROOT in KITTI's layout, checked before anything is used: ROOT/sequences/NAME/{velodyne/000000.bin ..., calib.txt}
     and, where there is ground truth, ROOT/poses/NAME.txt.
@@ -122,7 +117,6 @@ class Sequence:
     Velodyne frame or None. Raises FileNotFoundError or ValueError when anything is missing or does not fit together."""
 
     def __init__(self, root, name):
-        _check_name(name)
         self.name, self.folder = name, Path(root) / "sequences" / name
         velodyne = self.folder / "velodyne"
         if not self.folder.is_dir():
@@ -667,7 +661,8 @@ def _missing(root, names, seed, scans, azimuth):
     """Sequence -> its settings, of those that are not in ROOT yet. ValueError for what is there from elsewhere or with other settings."""
     jobs = {}
     for name in names:
-        _check_name(name)
+        if not isinstance(name, str) or name in ("", ".", "..") or re.search(r"[/\\\0]", name):
+            raise ValueError(f"The sequence name {name!r} is no plain folder name: use one such as '00'.")
         split = next((split for split in SPLITS if name in SPLITS[split]), "train")
         settings = {"city": CITY, "seed": int(seed), "scans": int(scans or SCANS[split]), "azimuth": int(azimuth)}
         folder, truth = root / "sequences" / name, root / "poses" / f"{name}.txt"
