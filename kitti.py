@@ -235,7 +235,6 @@ SENSOR_HEIGHT, MIN_RANGE, CITY_RANGE = 1.73, 2.5, 80.0  # m
 LANE = 3.5  # m; we keep to the right lane of two, so the road reaches from 1.75 m right to 5.25 m left of our path
 CELL = 0.5  # m, of the ground's raster
 RELIEF = 0.4  # m, depth of windows and doors in what is higher than 3 m
-SCANS = {"train": 320, "test": 170, "validation": 170}  # per sequence: enough for 100 m segments, few enough to make on the spot
 # what a sequence is like: cruising speed [m/s], odds of a street corner every 35-80 m (faster, further), stops, odds of (dense, suburban, open) surroundings
 STYLES = {"00": (12, 0.55, 0, (6, 3, 1)), "01": (26, 0.15, 0, (1, 3, 12)), "02": (15, 0.4, 0, (1, 6, 2)), "08": (12, 0.5, 1, (4, 4, 1)),
           "09": (19, 0.3, 0, (1, 3, 5)), "03": (10, 0.5, 0, (2, 5, 2)), "04": (18.5, 0.2, 0, (3, 3, 3)), "05": (12, 0.55, 1, (6, 3, 1)),
@@ -663,8 +662,8 @@ def _missing(root, names, seed, scans, azimuth):
     for name in names:
         if not isinstance(name, str) or name in ("", ".", "..") or re.search(r"[/\\\0]", name):
             raise ValueError(f"The sequence name {name!r} is no plain folder name: use one such as '00'.")
-        split = next((split for split in SPLITS if name in SPLITS[split]), "train")
-        settings = {"city": CITY, "seed": int(seed), "scans": int(scans or SCANS[split]), "azimuth": int(azimuth)}
+        enough = 170 if name in SPLITS["test"] + SPLITS["validation"] else 320  # for 100 m segments, few enough to make on the spot
+        settings = {"city": CITY, "seed": int(seed), "scans": int(scans or enough), "azimuth": int(azimuth)}
         folder, truth = root / "sequences" / name, root / "poses" / f"{name}.txt"
         made = folder / "simulated.json"
         if folder.exists() != made.exists() or truth.exists() and not folder.exists():
