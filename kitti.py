@@ -604,7 +604,7 @@ def progress(items, total, what):
     """Yields the items while saying on stderr how many of `total` are done, how fast, and how long the rest will take. On a terminal the line
     is rewritten in place; elsewhere a plain line comes every 10 s, or every tenth of the time so far when that is longer."""
     tty, began, done = sys.stderr.isatty(), time.monotonic(), 0
-    due = began  # when to say something again
+    due = began + (0.2 if tty else 10)  # s, when to say something again
 
     def say(end):
         rate = done / max(time.monotonic() - began, 1e-9)
@@ -615,7 +615,6 @@ def progress(items, total, what):
         for done, item in enumerate(items):
             if done and time.monotonic() > due:
                 say("" if tty else "\n")
-            if time.monotonic() > due:
                 due = time.monotonic() + (0.2 if tty else max(10, (time.monotonic() - began) / 10))
             yield item
             done += 1
