@@ -9,6 +9,7 @@ in the Velodyne frame, because that is what the points are in: T_velo = inv(Tr) 
 """
 import argparse, functools, json, os, re, shutil, signal, sys, threading, time, warnings, zlib
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -709,11 +710,8 @@ def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range
                 (temporary[name] / "calib.txt").write_text(calib)
                 (temporary[name] / "times.txt").write_text("".join(f"{0.1 * i:.6e}\n" for i in range(len(T))))
                 (temporary[name] / "simulated.json").write_text(json.dumps(settings))
-                try:
+                with suppress(OSError):  # another process was faster
                     temporary[name].rename(folder)
-                except OSError:  # another process was faster
-                    if not (folder / "simulated.json").exists():
-                        raise
             if (folder / "simulated.json").read_text() != json.dumps(settings):
                 raise ValueError(f"{folder} was made meanwhile, with other settings: choose another folder.")
             write_poses(root / "poses" / f"{name}.txt", velo_to_camera(invert(T[0]) @ T, Tr))  # last: without it a sequence is not complete
