@@ -690,8 +690,6 @@ def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range
     names = dict.fromkeys(m for n in names for m in (sum(SPLITS.values(), ()) if n == "all" else SPLITS.get(n, (n,))))
     jobs = _missing(root, names, seed, scans, azimuth)
     Tr, calib = _calibration()
-    (root / "sequences").mkdir(parents=True, exist_ok=True)
-    (root / "poses").mkdir(exist_ok=True)
     # one name per process: two of them may fill the same ROOT, and whoever finishes a sequence first has made it
     temporary = {n: temporary_beside(root / "sequences" / n) for n in jobs if not (root / "sequences" / n).exists()}
     tasks = [(folder / "velodyne" / f"{i:06d}.bin", n, jobs[n]["seed"], jobs[n]["scans"], jobs[n]["azimuth"], i)
