@@ -26,10 +26,9 @@ SPLITS = {"train": ("00", "01", "02", "08", "09"), "test": ("03", "04", "05", "0
 def _read(path, advice):
     try:
         return Path(path).read_bytes()
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{path} does not exist: {advice}.") from None
     except OSError as error:
-        raise ValueError(f"{path} cannot be read ({error.strerror}): {advice}.") from None
+        kind = FileNotFoundError if isinstance(error, FileNotFoundError) else ValueError
+        raise kind(f"{path} cannot be read ({error.strerror}): {advice}.") from None
 
 
 def _check_scan_size(path, size):
