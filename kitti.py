@@ -163,28 +163,17 @@ def open_sequences(root: str | Path, names: str | list[str] | None = None) -> li
     much of it as there is) or 'all'; None is 'all'. Raises FileNotFoundError when ROOT is not in KITTI's odometry layout, ValueError for an
     unknown name or a split of which nothing is there, and whatever `Sequence` raises."""
     root = Path(root)
-    if not (root / "sequences").is_dir():
-        if any(re.search(r"_drive_\d+|^velodyne_points$", p.name) for p in (root, *root.glob("*"), *root.glob("*/*"))):
-            raise FileNotFoundError(f"{root} is in the layout of KITTI's raw data, which is not what this reads: use the odometry benchmark's "
-                                    "archives (data_odometry_velodyne, _calib, _poses).")
     there = sorted(p.name for p in (root / "sequences").glob("*") if p.is_dir() and not p.name.startswith("."))
     if not there:
-        raise FileNotFoundError(f"{root} has no sequences: expected ROOT/sequences/00/velodyne/000000.bin, ROOT/sequences/00/calib.txt "
-                                "and ROOT/poses/00.txt, as KITTI's odometry archives unpack.")
-    chosen = []
-    for name in ["all"] if names is None else [names] if isinstance(names, str) else names:
-        if name in there:
-            chosen.append(name)
-        elif name == "all":
-            chosen += there
-        elif name in SPLITS:
-            if not set(SPLITS[name]) & set(there):
-                raise ValueError(f"{root} has no sequence of the split '{name}' ({' '.join(SPLITS[name])}), only {' '.join(there)}: "
-                                 "name sequences that are there.")
-            chosen += [n for n in SPLITS[name] if n in there]
-        else:
-            raise ValueError(f"{root} has no sequence {name!r}: there are {' '.join(there)}, the splits {', '.join(SPLITS)}, and 'all'.")
-    return [Sequence(root, name) for name in dict.fromkeys(chosen)]
+        raw = any(re.search(r"_drive_\d+|^velodyne_points$", p.name) for p in (root, *root.glob("*"), *root.glob("*/*")))
+        raise FileNotFoundError(f"{root} has no sequences{', it is in the layout of KITTI raw data' if raw else ''}: expected ROOT/sequences/00/"
+                                "{velodyne/000000.bin, calib.txt} and ROOT/poses/00.txt, as KITTI's odometry archives unpack.")
+    choices = {split: [n for n in part if n in there] for split, part in SPLITS.items()} | {"all": there} | {n: [n] for n in there}
+    names = ["all"] if names is None else [names] if isinstance(names, str) else list(names)
+    for name in names:
+        if not choices.get(name):
+            raise ValueError(f"{root} has no sequence of the name or split {name!r}: there are {' '.join(n for n in choices if choices[n])}.")
+    return [Sequence(root, n) for n in dict.fromkeys(n for name in names for n in choices[name])]
 
 
 # ------------------------------------------------------------------------------------------------------------ the plane
