@@ -119,21 +119,16 @@ class Sequence:
     def __init__(self, root, name):
         self.name, self.folder = name, Path(root) / "sequences" / name
         velodyne = self.folder / "velodyne"
-        if not self.folder.is_dir():
-            raise FileNotFoundError(f"{self.folder} does not exist: expected ROOT/sequences/{name}/velodyne/000000.bin.")
         self.scan_paths = sorted(velodyne.glob("*.bin"))
         if not self.scan_paths:
-            images = any((self.folder / f"image_{k}").is_dir() for k in range(4))
-            raise FileNotFoundError(f"{velodyne} holds no scans" + (" though there are images: that was the wrong archive" if images else "")
-                                    + ", unpack data_odometry_velodyne.zip over it.")
+            raise FileNotFoundError(f"{velodyne} holds no scans: unpack data_odometry_velodyne.zip over it, KITTI's other archives have none.")
         for i, path in enumerate(self.scan_paths):
             if path.name != f"{i:06d}.bin":
-                raise ValueError(f"{velodyne} should hold {i:06d}.bin next but holds {path.name}: scans are numbered from 000000 without a gap, "
-                                 "unpack data_odometry_velodyne.zip again.")
+                raise ValueError(f"{velodyne} should hold {i:06d}.bin next but holds {path.name}: scans are numbered from 000000 without "
+                                 "a gap, unpack data_odometry_velodyne.zip again.")
             _check_scan_size(path, os.stat(path).st_size)
         self.Tr = read_calib(self.folder / "calib.txt")
         self.poses_cam = self.poses = None
-        # SemanticKITTI's sequences/NN/poses.txt is what a SLAM system (SuMa) estimated, so it is never read as the truth
         truth = Path(root) / "poses" / f"{name}.txt"
         if truth.exists():
             self.poses_cam = read_poses(truth)  # (n,4,4)
@@ -153,8 +148,8 @@ class Sequence:
         """(n-1,4,4) T_{t,t+1} = inv(T_t) @ T_{t+1} (paper eq. 1) in the Velodyne frame: maps points of scan t+1 into scan t.
         Raises ValueError when the sequence has no ground truth."""
         if self.poses is None:
-            estimate = "; its poses.txt is SemanticKITTI's, estimated by SuMa, and no ground truth" * (self.folder / "poses.txt").exists()
-            raise ValueError(f"Sequence {self.name} has no ground truth: put the official poses/{self.name}.txt beside sequences/{estimate}.")
+            raise ValueError(f"Sequence {self.name} has no ground truth: put the official poses/{self.name}.txt beside sequences/ "
+                             f"(SemanticKITTI's sequences/{self.name}/poses.txt is no truth, SuMa estimated it).")
         return invert(self.poses[:-1]) @ self.poses[1:]
 
 
