@@ -49,19 +49,17 @@ def read_scan(path: str | Path) -> np.ndarray:
 def read_calib(path: str | Path) -> np.ndarray:
     """calib.txt of a sequence -> T_cam0_velo (4,4) float64, its row `Tr`: Velodyne points to the rectified left camera [m].
     Raises FileNotFoundError; ValueError when `Tr` is missing, is not 12 finite numbers or does not hold a rotation."""
-    get = "it is in KITTI's data_odometry_calib.zip; for scans and poses of your own in one frame write the line Tr: 1 0 0 0 0 1 0 0 0 0 1 0"
-    row = re.search(rb"^\s*Tr\s*:(.*)$", _read(path, get), re.M)
-    if row is None:
-        raise ValueError(f"{path} has no row 'Tr' (Velodyne to camera): {get}, the calibration of the images alone will not do.")
+    get = "KITTI's is in data_odometry_calib.zip; for scans and poses of your own in one frame write the line Tr: 1 0 0 0 0 1 0 0 0 0 1 0"
+    rows = re.findall(rb"^\s*Tr\s*:(.*)$", _read(path, get), re.M)
     try:
-        Tr = np.vstack([np.array(row[1].split(), dtype=float).reshape(3, 4), [0, 0, 0, 1]])  # (4,4)
-    except ValueError:
+        Tr = np.vstack([np.array(b"".join(rows[:1]).split(), dtype=float).reshape(3, 4), [0, 0, 0, 1]])  # (4,4)
+    except ValueError:  # no such row, or not of 12 numbers
         Tr = np.full((4, 4), np.nan)
     R = Tr[:3, :3]
     with np.errstate(all="ignore"):  # of absurd numbers
         right = np.isfinite(Tr).all() and np.abs(R @ R.T - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0
     if not right:
-        raise ValueError(f"{path}: the row 'Tr' must be 12 finite numbers, a rotation and a translation: {get}.")
+        raise ValueError(f"{path} has no row 'Tr' (Velodyne to camera) of 12 finite numbers, a rotation and a translation: {get}.")
     return Tr
 
 
