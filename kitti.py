@@ -33,7 +33,7 @@ def _read(path, advice):
 
 def _check_scan_size(path, size):
     if size == 0 or size % 16:
-        raise ValueError(f"{path} has {size} bytes, but a KITTI scan has 16 (four float32) for each of its points: copy or unpack it again.")
+        raise ValueError(f"{path} has {size} bytes, but a KITTI scan has 16 (four float32) for each point: copy or unpack it again.")
 
 
 def read_scan(path: str | Path) -> np.ndarray:
@@ -88,7 +88,7 @@ def to_vector(T: np.ndarray) -> np.ndarray:
     """Rigid transforms (...,4,4) -> (...,6) float64: [tx, ty, tz] m, [roll, pitch, yaw] degrees, extrinsic x-y-z (paper 3.2)."""
     T = np.asarray(T, dtype=float)
     flat = T.reshape(-1, 4, 4)
-    with warnings.catch_warnings():  # gimbal lock (pitch +-90 degrees): scipy sets the third angle to zero, which is still the same rotation
+    with warnings.catch_warnings():  # gimbal lock (pitch +-90 degrees): scipy sets the third angle to zero, still the same rotation
         warnings.simplefilter("ignore", UserWarning)
         angles = Rotation.from_matrix(flat[:, :3, :3]).as_euler("xyz", degrees=True) if len(flat) else np.empty((0, 3))
     return np.concatenate([flat[:, :3, 3], angles], axis=1).reshape(T.shape[:-2] + (6,))
@@ -119,7 +119,7 @@ class Sequence:
         velodyne = self.folder / "velodyne"
         self.scan_paths = sorted(velodyne.glob("*.bin"))
         if not self.scan_paths:
-            raise FileNotFoundError(f"{velodyne} holds no scans: unpack data_odometry_velodyne.zip over it, KITTI's other archives have none.")
+            raise FileNotFoundError(f"{velodyne} holds no scans: unpack data_odometry_velodyne.zip over it, other archives have none.")
         for i, path in enumerate(self.scan_paths):
             if path.name != f"{i:06d}.bin":
                 raise ValueError(f"{velodyne} should hold {i:06d}.bin next but holds {path.name}: scans are numbered from 000000 without "
@@ -159,23 +159,23 @@ def open_sequences(root: str | Path, names: str | list[str] | None = None) -> li
     there = sorted(p.name for p in (root / "sequences").glob("*") if p.is_dir() and not p.name.startswith("."))
     if not there:
         raw = any(re.search(r"_drive_\d+|^velodyne_points$", p.name) for p in (root, *root.glob("*"), *root.glob("*/*")))
-        raise FileNotFoundError(f"{root} has no sequences{', it is in the layout of KITTI raw data' if raw else ''}: expected ROOT/sequences/00/"
-                                "{velodyne/000000.bin, calib.txt} and ROOT/poses/00.txt, as KITTI's odometry archives unpack.")
+        raise FileNotFoundError(f"{root} has no sequences{', it is in the layout of KITTI raw data' if raw else ''}: expected "
+                                "ROOT/sequences/00/{velodyne/000000.bin, calib.txt} and ROOT/poses/00.txt, as the odometry archives unpack.")
     choices = {split: [n for n in part if n in there] for split, part in SPLITS.items()} | {"all": there} | {n: [n] for n in there}
     names = ["all"] if names is None else [names] if isinstance(names, str) else list(names)
     for name in names:
         if not choices.get(name):
-            raise ValueError(f"{root} has no sequence of the name or split {name!r}: there are {' '.join(n for n in choices if choices[n])}.")
+            raise ValueError(f"{root} has no sequence or split {name!r}: there are {' '.join(n for n in choices if choices[n])}.")
     return [Sequence(root, n) for n in dict.fromkeys(n for name in names for n in choices[name])]
 
 
 # ------------------------------------------------------------------------------------------------------------ the plane
 
 def remove_plane(scan: np.ndarray, threshold=0.15, max_tilt=15.0, hypotheses=400, subsample=4000, seed=0) -> np.ndarray:
-    """A scan (N,3+) -> the scan without the points nearer than `threshold` [m] to its dominant near-horizontal plane (RANSAC; paper 4), order kept.
+    """A scan (N,3+) -> the scan without the points nearer than `threshold` [m] to its dominant near-horizontal plane (RANSAC; paper 4).
 
     Planes through three random points whose normal is within `max_tilt` degrees of vertical are scored all at once on a random subsample;
-    the best is fitted again, twice, to all its inliers. Returned unchanged when no plane qualifies. Non-finite points are kept."""
+    the best is fitted again, twice, to all its inliers. Order and non-finite points are kept; unchanged when no plane qualifies."""
     rng = np.random.default_rng(seed)
     xyz = np.ascontiguousarray(scan[:, :3], dtype=np.float32)  # (N,3)
     good = np.flatnonzero(np.isfinite(xyz).all(axis=1))
@@ -210,21 +210,23 @@ def remove_plane(scan: np.ndarray, threshold=0.15, max_tilt=15.0, hypotheses=400
 
 # ---------------------------------------------------------------------------------------------------- the simulated city
 # The world is vertical prisms on a ground, one row each: yawed boxes and upright cylinders. It is flat, and hills bend it afterwards.
-X, Y, YAW, HALF_X, HALF_Y, Z0, Z1, ALBEDO, FUZZ, ROUND = range(10)  # m, radians; FUZZ: depth [m] to which foliage lets light in; ROUND: a cylinder
+# In m and radians; FUZZ is the depth [m] to which foliage lets light in, ROUND is 1 for a cylinder.
+X, Y, YAW, HALF_X, HALF_Y, Z0, Z1, ALBEDO, FUZZ, ROUND = range(10)
 CITY = 3  # raise when the city changes, so that scans of two versions are never mixed
 ELEVATION = np.radians(np.r_[np.linspace(-24.33, -8.83, 32), np.linspace(-8.33, 2.0, 32)])  # the HDL-64E's 64 beams, bottom to top
 SENSOR_HEIGHT, MIN_RANGE, CITY_RANGE = 1.73, 2.5, 80.0  # m
 LANE = 3.5  # m; we keep to the right lane of two, so the road reaches from 1.75 m right to 5.25 m left of our path
 CELL = 0.5  # m, of the ground's raster
 RELIEF = 0.4  # m, depth of windows and doors in what is higher than 3 m
-# what a sequence is like: cruising speed [m/s], odds of a street corner every 35-80 m (faster, further), stops, odds of (dense, suburban, open) surroundings
+# what a sequence is like: cruising speed [m/s], odds of a street corner every 35-80 m (faster: further), stops, and
+# odds of (dense, suburban, open) surroundings
 STYLES = {"00": (12, 0.55, 0, (6, 3, 1)), "01": (26, 0.15, 0, (1, 3, 12)), "02": (15, 0.4, 0, (1, 6, 2)), "08": (12, 0.5, 1, (4, 4, 1)),
           "09": (19, 0.3, 0, (1, 3, 5)), "03": (10, 0.5, 0, (2, 5, 2)), "04": (18.5, 0.2, 0, (3, 3, 3)), "05": (12, 0.55, 1, (6, 3, 1)),
           "06": (16, 0.4, 0, (3, 5, 1)), "10": (13, 0.5, 1, (2, 4, 3)), "07": (12, 0.5, 1, (6, 3, 1))}
 
 
 def _drive(rng, scans, style):
-    """A road and a drive along it. -> at(s, left=0): x, y, heading at `s` metres along the road; s_of(t): metres at t [s]; the road's length."""
+    """A road and a drive on it -> at(s, left=0): x, y, heading at `s` metres along the road; s_of(t): metres at t [s]; its length [m]."""
     cruise, corners, stops, _ = style
     ds, start, length = 0.25, 100.0, 100 + 0.13 * cruise * scans + 150  # m; road before and behind us for what we see there
     pieces = []  # length [m], curvature [1/m], speed [m/s]: straight ahead, a bend, perhaps a street corner
@@ -303,8 +305,9 @@ def _cars(x, y, yaw, looks):
     """Cars (n,) -> (2n,10) prisms: a body one can look under, and a cabin of which the windows return little."""
     length, height, albedo = looks
     waist, back = np.where(height > 1.9, 0.5 * height, 0.9), 0.08 * length
-    return np.concatenate([_rows(x, y, yaw, length / 2, 0.88, 0.25, waist, albedo, 0, 0),
-                           _rows(x - back * np.cos(yaw), y - back * np.sin(yaw), yaw, 0.29 * length, 0.78, waist, height, 0.6 * albedo, 0, 0)])
+    body = _rows(x, y, yaw, length / 2, 0.88, 0.25, waist, albedo, 0, 0)
+    x, y = x - back * np.cos(yaw), y - back * np.sin(yaw)
+    return np.concatenate([body, _rows(x, y, yaw, 0.29 * length, 0.78, waist, height, 0.6 * albedo, 0, 0)])
 
 
 def _looks(rng, n=None):
@@ -342,10 +345,11 @@ class _Street:
             if rng.random() < (0.95, 0.8, 0.3)[kind]:
                 put(mid, side * (back + depth / 2), plot / 2, depth / 2, 0, u(5, 14), shade, twist=rng.normal() * 0.02)
                 for _ in range(rng.integers(2, 6)):  # bays, stairs, porches: without relief a street looks the same from metre to metre
-                    put(mid + u(-0.45, 0.45) * plot, side * (back - (out_by := u(0.1, 0.5))), u(0.3, 1.5), out_by, 0, u(1, 7), shade * u(0.7, 1.3))
+                    along, out_by = mid + u(-0.45, 0.45) * plot, u(0.1, 0.5)
+                    put(along, side * (back - out_by), u(0.3, 1.5), out_by, 0, u(1, 7), shade * u(0.7, 1.3))
             if kind and rng.random() < 0.65:  # the border of the plot: a hedge, a wall or a fence
-                hedge = rng.random() < 0.6
-                put(mid, side * (edge + u(2.2, 3.2)), plot * u(0.3, 0.48), 0.35 if hedge else 0.1, 0, u(0.6, 1.9), u(0.2, 0.4), fuzz=0.25 * hedge)
+                thick, fuzz = (0.35, 0.25) if rng.random() < 0.6 else (0.1, 0)
+                put(mid, side * (edge + u(2.2, 3.2)), plot * u(0.3, 0.48), thick, 0, u(0.6, 1.9), u(0.2, 0.4), fuzz)
             for _ in range(rng.poisson((0.6, 2, 2)[kind])):  # trees and bushes of the garden
                 self.tree(s + u(0, 1) * plot, side * u(edge + 3, back + 3))
                 put(s + u(0, 1) * plot, side * (edge + u(3, 7)), r := u(0.4, 1.2), r, 0, u(0.5, 1.8), u(0.2, 0.4), fuzz=0.25, round_=1)
@@ -522,7 +526,7 @@ def _meet_prisms(p, eye, rays, rng):
     z = m * enter[g]
     above, below = z > z1[g] + 1e-3, z < z0[g] - 1e-3
     with np.errstate(divide="ignore", invalid="ignore"):
-        reach = np.where(above | below, np.where(above, z1[g], z0[g]) / m, enter[g])  # if not its face, the ray meets its top or its underside
+        reach = np.where(above | below, np.where(above, z1[g], z0[g]) / m, enter[g])  # its top or its underside, if not its face
     d, cosine, shade, blur = out = np.zeros((4, len(rays.slope)), f4)
     d[:] = np.inf
     np.minimum.at(d, ray, reach)
@@ -578,13 +582,14 @@ def _simulate_scan(name, seed, scans, azimuth, i):
     d = r * rays.cos_w[ray]
     x, y, z = d * rays.cos_a[col], d * rays.sin_a[col], r * rays.sin_w[ray]  # from the eye, axes of the world
     z += (hills(x + f4(eye[0]), y + f4(eye[1])) - hills(*eye[:2])).astype(f4)  # what a crest would hide is still seen
-    x, y, z = (x * q[0] + y * q[1] + z * q[2] for q in R.T.astype(f4))  # R^T turns them into the sensor's; no BLAS, whose sums depend on its threads
+    # R^T turns them into the sensor's; no BLAS, whose sums depend on its threads
+    x, y, z = (x * q[0] + y * q[1] + z * q[2] for q in R.T.astype(f4))
     return np.stack([x, y, z, np.round(np.clip(light, 0, 0.99), 2)], axis=1)  # (N,4)
 
 
 def progress(items, total, what):
-    """Yields the items while saying on stderr how many of `total` are done, how fast, and how long the rest will take. On a terminal the line
-    is rewritten in place; elsewhere a plain line comes every 10 s, or every tenth of the time so far when that is longer."""
+    """Yields the items while saying on stderr how many of `total` are done, how fast, and how long the rest will take. On a terminal the
+    line is rewritten in place; elsewhere a plain line comes every 10 s, or every tenth of the time so far when that is longer."""
     tty, began, done = sys.stderr.isatty(), time.monotonic(), 0
     due = began + (0.2 if tty else 10)  # s, when to say something again
 
@@ -627,8 +632,8 @@ def _save_scan(path, *what):
 
 
 def _calibration():
-    """Tr (4,4) and the text of calib.txt, of a camera that looks along x as KITTI's does: axes permuted, a fraction of a degree off, 8 cm lower
-    and 27 cm further ahead."""
+    """Tr (4,4) and the text of calib.txt, of a camera that looks along x as KITTI's does: axes permuted, a fraction of a degree off, 8 cm
+    lower and 27 cm further ahead."""
     Tr = np.eye(4)
     Tr[:3, :3] = Rotation.from_euler("xyz", [0.4, -0.5, 0.3], degrees=True).as_matrix() @ [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
     Tr[:3, 3] = [-0.012, -0.076, -0.272]
@@ -680,7 +685,8 @@ def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range
     try:
         for folder in temporary.values():
             (folder / "velodyne").mkdir(parents=True)
-        saved = progress(pool.map(_save_scan, *zip(*tasks), chunksize=8) if pool else (_save_scan(*t) for t in tasks), len(tasks), "simulating")
+        saved = pool.map(_save_scan, *zip(*tasks), chunksize=8) if pool else (_save_scan(*task) for task in tasks)
+        saved = progress(saved, len(tasks), "simulating")
         for name, settings in jobs.items():
             T, folder = _world(name, settings["seed"], settings["scans"])[0], root / "sequences" / name
             if name in temporary:
