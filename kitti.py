@@ -160,7 +160,7 @@ def open_sequences(root: str | Path, names: str | list[str] | None = None) -> li
     if not there:
         raw = any(re.search(r"_drive_\d+|^velodyne_points$", p.name) for p in (root, *root.glob("*"), *root.glob("*/*")))
         raise FileNotFoundError(f"{root} has no sequences{', it is in the layout of KITTI raw data' if raw else ''}: expected "
-                                "ROOT/sequences/00/{velodyne/000000.bin, calib.txt} and ROOT/poses/00.txt, as the odometry archives unpack.")
+                                "ROOT/sequences/00/{velodyne/000000.bin, calib.txt} and ROOT/poses/00.txt, as KITTI's archives unpack.")
     choices = {split: [n for n in part if n in there] for split, part in SPLITS.items()} | {"all": there} | {n: [n] for n in there}
     names = ["all"] if names is None else [names] if isinstance(names, str) else list(names)
     for name in names:
@@ -279,22 +279,19 @@ def _ego(rng, at, s_of, scans):
     return T
 
 
-def _hills(rng):
-    """The land: height(x, y) [m], the sum of waves 80 to 400 m long; its slopes are some 3 % (rms)."""
+def _hills(rng, T):
+    """The land: height(x, y) [m], the sum of waves 80 to 400 m long, slopes of some 3 % (rms). Then the poses T_wt (n,4,4) of the flat
+    world upon it: lifted, and tilted with the slope."""
     k = 2 * np.pi / np.geomspace(80, 400, 6)  # rad/m
     way, phase = rng.uniform(0, 2 * np.pi, (2, 6))
     waves = np.stack([k * np.cos(way), k * np.sin(way), phase, 0.017 / k], axis=1).tolist()
-    return lambda x, y: sum(size * np.sin(kx * x + ky * y + phase) for kx, ky, phase, size in waves)
-
-
-def _uphill(T, height):
-    """Poses T_wt (n,4,4) in the flat world -> those on the hills: lifted, and tilted with the slope."""
+    height = lambda x, y: sum(size * np.sin(kx * x + ky * y + phase) for kx, ky, phase, size in waves)
     x, y, d = T[:, 0, 3], T[:, 1, 3], 0.5
     slope = np.stack([height(x, y + d) - height(x, y - d), height(x - d, y) - height(x + d, y), 0 * x], axis=1) / (2 * d)
-    out = T.copy()
-    out[:, :3, :3] = Rotation.from_rotvec(slope).as_matrix() @ T[:, :3, :3]
-    out[:, 2, 3] += height(x, y)
-    return out
+    T_hills = T.copy()
+    T_hills[:, :3, :3] = Rotation.from_rotvec(slope).as_matrix() @ T[:, :3, :3]
+    T_hills[:, 2, 3] += height(x, y)
+    return height, T_hills
 
 
 def _rows(*columns):
@@ -447,8 +444,8 @@ def _world(name, seed, scans):
     def moving(i):
         k = here[:, i]
         return _cars(*at(s[k, i], left[k]), looks[:, k])
-    ground, hills = _ground(rng, at, length), _hills(rng)
-    return _uphill(T, hills), T, prisms, moving, ground, hills
+    ground, (hills, T_hills) = _ground(rng, at, length), _hills(rng, T)
+    return T_hills, T, prisms, moving, ground, hills
 
 
 class _Rays:
