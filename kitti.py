@@ -648,12 +648,10 @@ def _missing(root, names, seed, scans, azimuth):
         enough = 170 if name in SPLITS["test"] + SPLITS["validation"] else 320  # for 100 m segments, few enough to make on the spot
         settings = {"city": CITY, "seed": int(seed), "scans": int(scans or enough), "azimuth": int(azimuth)}
         folder, truth = root / "sequences" / name, root / "poses" / f"{name}.txt"
-        made = folder / "simulated.json"
-        if folder.exists() != made.exists() or truth.exists() and not folder.exists():
-            raise ValueError(f"{folder if folder.exists() else truth} is there already and was not simulated: choose another folder.")
-        if made.exists() and made.read_text() != json.dumps(settings):
-            raise ValueError(f"{folder} was simulated with other settings, {made.read_text()}: choose another folder.")
-        if not (made.exists() and truth.exists()):
+        made = (folder / "simulated.json").read_text() if (folder / "simulated.json").exists() else "without simulation"
+        if (folder.exists() or truth.exists()) and made != json.dumps(settings):
+            raise ValueError(f"{folder} or {truth} is there already, made {made}, and not {json.dumps(settings)}: choose another folder.")
+        if not (folder.exists() and truth.exists()):
             jobs[name] = settings
     return jobs
 
