@@ -23,14 +23,6 @@ SPLITS = {"train": ("00", "01", "02", "08", "09"), "test": ("03", "04", "05", "0
 
 # ---------------------------------------------------------------------------------------------------------------- files
 
-def _read(path, advice):
-    try:
-        return Path(path).read_bytes()
-    except OSError as error:
-        kind = FileNotFoundError if isinstance(error, FileNotFoundError) else ValueError
-        raise kind(f"{path} cannot be read ({error.strerror}): {advice}.") from None
-
-
 def _check_scan_size(path, size):
     if size == 0 or size % 16:
         raise ValueError(f"{path} has {size} bytes, but a KITTI scan has 16 (four float32) for each point: copy or unpack it again.")
@@ -38,8 +30,8 @@ def _check_scan_size(path, size):
 
 def read_scan(path: str | Path) -> np.ndarray:
     """One velodyne/*.bin -> (N,4) float32: x, y, z [m] in the Velodyne frame, intensity 0..1, as in the file (NaN included).
-    Raises FileNotFoundError, or ValueError when the file is empty, of another format, or its size is no multiple of 16 bytes."""
-    data = _read(path, "give the path of a KITTI scan (velodyne/000000.bin)")
+    Raises OSError when it cannot be read, ValueError when it is empty, of another format, or its size is no multiple of 16 bytes."""
+    data = Path(path).read_bytes()
     if data.startswith((b"\x93NUMPY", b"ply\n", b"ply\r", b"# .PCD")):
         raise ValueError(f"{path} is no KITTI scan but another format: read it with its own library and hand over x, y, z, intensity.")
     _check_scan_size(path, len(data))
@@ -49,8 +41,11 @@ def read_scan(path: str | Path) -> np.ndarray:
 def read_calib(path: str | Path) -> np.ndarray:
     """calib.txt of a sequence -> T_cam0_velo (4,4) float64, its row `Tr`: Velodyne points to the rectified left camera [m].
     Raises FileNotFoundError; ValueError when `Tr` is missing, is not 12 finite numbers or does not hold a rotation."""
+    path = Path(path)
     get = "KITTI's is in data_odometry_calib.zip; for scans and poses of your own in one frame write the line Tr: 1 0 0 0 0 1 0 0 0 0 1 0"
-    rows = re.findall(rb"^\s*Tr\s*:(.*)$", _read(path, get), re.M)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist: {get}.")
+    rows = re.findall(rb"^\s*Tr\s*:(.*)$", path.read_bytes(), re.M)
     try:
         Tr = np.vstack([np.array(b"".join(rows[:1]).split(), dtype=float).reshape(3, 4), [0, 0, 0, 1]])  # (4,4)
     except ValueError:  # no such row, or not of 12 numbers
