@@ -46,10 +46,7 @@ def replacing(path):
 
 def read_poses(path: str | Path) -> np.ndarray:
     """A KITTI pose file, 12 numbers a row (the top three rows of a 4x4), as (n,4,4) float64. ValueError, FileNotFoundError."""
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such pose file")
-    rows = [(number, line.split()) for number, line in enumerate(path.read_bytes().splitlines(), 1) if line.strip()]
+    rows = [(number, line.split()) for number, line in enumerate(Path(path).read_bytes().splitlines(), 1) if line.strip()]
     if not rows:
         raise ValueError(f"{path}: holds no pose")
     T = np.tile(np.eye(4), (len(rows), 1, 1))                                       # (n,4,4)
