@@ -643,9 +643,11 @@ def _missing(root, names, seed, scans, azimuth):
         enough = 170 if name in SPLITS["test"] + SPLITS["validation"] else 320  # for 100 m segments, few enough to make on the spot
         settings = {"city": CITY, "seed": int(seed), "scans": int(scans or enough), "azimuth": int(azimuth)}
         folder, truth = root / "sequences" / name, root / "poses" / f"{name}.txt"
-        made = (folder / "simulated.json").read_text() if (folder / "simulated.json").exists() else "without simulation"
-        if (folder.exists() or truth.exists()) and made != json.dumps(settings):
-            raise ValueError(f"{folder} or {truth} is there already, made {made}, and not {json.dumps(settings)}: choose another folder.")
+        made = folder / "simulated.json"
+        if folder.exists() or truth.exists():  # another process may make it at any moment, so only now see what it is
+            found = made.read_text() if made.exists() else "without simulation"
+            if found != json.dumps(settings):
+                raise ValueError(f"{folder} or {truth} is there already, made {found}, not {json.dumps(settings)}: choose another folder.")
         if not (folder.exists() and truth.exists()):
             jobs[name] = settings
     return jobs
