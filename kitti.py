@@ -619,8 +619,8 @@ def terminate_as_interrupted():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
-def _save_scan(path, *what):
-    _simulate_scan(*what).tofile(path)
+def _save_scan(path, name, settings, i):
+    _simulate_scan(name, settings["seed"], settings["scans"], settings["azimuth"], i).tofile(path)
 
 
 def _calibration():
@@ -670,8 +670,7 @@ def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range
     Tr, calib = _calibration()
     # one name per process: two of them may fill the same ROOT, and whoever finishes a sequence first has made it
     temporary = {n: temporary_beside(root / "sequences" / n) for n in jobs if not (root / "sequences" / n).exists()}
-    tasks = [(folder / "velodyne" / f"{i:06d}.bin", n, jobs[n]["seed"], jobs[n]["scans"], jobs[n]["azimuth"], i)
-             for n, folder in temporary.items() for i in range(jobs[n]["scans"])]
+    tasks = [(folder / "velodyne" / f"{i:06d}.bin", n, jobs[n], i) for n, folder in temporary.items() for i in range(jobs[n]["scans"])]
     workers = int(workers or cores())
     pool = ProcessPoolExecutor(workers, initializer=worker_starts) if workers > 1 and len(tasks) > 8 else None
     try:
