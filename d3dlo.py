@@ -1052,8 +1052,8 @@ def number(text):
     return int(text)
 
 
-def command_line():
-    """The parser. What it gives holds only the options that were given: defaults are those of `train`, `evaluate` and `Config`."""
+def command_line(argv):
+    """Arguments -> {option: value}, only of those that were given: defaults are those of `train`, `evaluate` and `Config`."""
     how = dict(formatter_class=argparse.RawDescriptionHelpFormatter, argument_default=argparse.SUPPRESS)
     paragraphs = __doc__.split("\n\n")
     parser = argparse.ArgumentParser(prog="d3dlo", description=f"{paragraphs[0]}\n\n{paragraphs[-1]}", **how)
@@ -1094,7 +1094,10 @@ def command_line():
     add = e.add_argument_group("results").add_argument
     add("--out", metavar="DIR", help="folder for NN.txt and results.json (default: results/TIME)")
     add("--plot", action="store_true", help="draw the paths and the errors by length; needs matplotlib")
-    return parser
+    args, strange = parser.parse_known_args(argv)
+    if strange:
+        commands.choices[args.command].error(f"unrecognized arguments: {' '.join(strange)}")         # with the command's usage
+    return vars(args)
 
 
 def config_from(args):
@@ -1108,7 +1111,7 @@ def config_from(args):
 
 def main(argv=None):
     """The command line -> exit code: 0, 2 for bad input, 130 when interrupted."""
-    args = vars(command_line().parse_args(argv))
+    args = command_line(argv)
     keep_freed_memory()
     kitti.terminate_as_interrupted()
     try:

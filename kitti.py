@@ -9,7 +9,6 @@ in the Velodyne frame, because that is what the points are in: T_velo = inv(Tr) 
 """
 import argparse, functools, json, os, re, shutil, signal, sys, threading, time, warnings, zlib
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -645,9 +644,9 @@ def _missing(root, names, seed, scans, azimuth):
         folder, truth = root / "sequences" / name, root / "poses" / f"{name}.txt"
         made = folder / "simulated.json"
         if folder.exists() or truth.exists():  # another process may make it at any moment, so only now see what it is
-            found = made.read_text() if made.exists() else "without simulation"
+            found = made.read_text() if made.exists() else "not simulated"
             if found != json.dumps(settings):
-                raise ValueError(f"{folder} or {truth} is there already, made {found}, not {json.dumps(settings)}: choose another folder.")
+                raise ValueError(f"{folder} or {truth} is there already, {found} and not {json.dumps(settings)}: choose another folder.")
         if not (folder.exists() and truth.exists()):
             jobs[name] = settings
     return jobs
@@ -686,8 +685,11 @@ def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range
                 (temporary[name] / "calib.txt").write_text(calib)
                 (temporary[name] / "times.txt").write_text("".join(f"{0.1 * i:.6e}\n" for i in range(len(T))))
                 (temporary[name] / "simulated.json").write_text(json.dumps(settings))
-                with suppress(OSError):  # another process was faster
+                try:
                     temporary[name].rename(folder)
+                except OSError:  # another process was faster, or it cannot be
+                    if not (folder / "simulated.json").exists():
+                        raise
             if (folder / "simulated.json").read_text() != json.dumps(settings):
                 raise ValueError(f"{folder} was made meanwhile, with other settings: choose another folder.")
             write_poses(root / "poses" / f"{name}.txt", velo_to_camera(invert(T[0]) @ T, Tr))  # last: without it a sequence is not complete
