@@ -172,19 +172,7 @@ def test_scan_geometry_is_fps_and_grouping_of_what_is_usable(seed, spread):
     assert_array_equal(g["idx2"], group_ball(xyz[picks], np.arange(16), 4.0, 8, spread=spread))
     assert_array_equal(g["idx3"], group_ball(xyz[picks[:16]], np.arange(8), 8.0, 4, spread=spread))
     fullest = max(((xyz[:, 2] >= z) & (xyz[:, 2] < z + 0.3)).sum() for z in np.arange(-10, 10) * 0.3)
-    assert_allclose(g["looks"], [200, usable[:, 3].mean(), np.median(np.hypot(np.hypot(*g["xyz"].T[:2]), g["xyz"].T[2])), fullest / 200], rtol=0.02)
-
-
-@given(SEED)
-def test_scan_geometry_knows_neither_the_order_of_points_nor_where_the_scan_is(seed):
-    rng = generator(seed)
-    scan, T = cloud(rng, 300), motion(rng, [5, 5, 1, 1, 1, 90])
-    g, h = scan_geometry(scan, SMALL), scan_geometry(moved_scan(T, scan), SMALL)
-    shuffled = scan_geometry(np.r_[scan[:1], rng.permutation(scan[1:])], SMALL)     # FPS starts at the first point
-    assert all(shuffled[name].tobytes() == g[name].tobytes() for name in ("xyz", "group", "idx2", "idx3"))
-    assert_allclose(move(T, g["xyz"]), h["xyz"], atol=1e-4)             # the same picks
-    assert_array_equal(g["idx2"], h["idx2"])
-    assert_allclose(g["group"][..., :3] @ T[:3, :3].T, h["group"][..., :3], atol=1e-4)
+    assert_allclose(g["looks"], [200, usable[:, 3].mean(), np.median(np.sqrt(np.square(g["xyz"]).sum(1))), fullest / 200], rtol=0.02)
 
 
 # --------------------------------------------------------------------------------------------------------------- motions
