@@ -354,13 +354,11 @@ def test_every_loss_is_what_it_says_and_has_finite_gradients(seed, kind, width, 
 
 
 @given(SEED)
-def test_quaternions_and_euler_angles_tell_the_same_motion(seed):
-    T = motion(generator(seed), (2, 1, 1, 60, 30, 60), n=4)
-    for config, width in (SMALL, 6), (VARIANTS["quaternion"], 7):
-        y = d3dlo.to_output(T, config)
-        assert y.shape == (4, width)
-        assert_allclose(d3dlo.from_output(y, config), T, atol=1e-9)
-    assert_allclose(d3dlo.from_output(y * ([1] * 3 + [-1] * 4), config), T, atol=1e-9)
+def test_quaternions_survive_the_round_trip_and_minus_q_is_q(seed):
+    T, config = motion(generator(seed), (2, 1, 1, 60, 30, 60), n=4), VARIANTS["quaternion"]
+    y = d3dlo.to_output(T, config)
+    for same in (y, y * ([1] * 3 + [-1] * 4)):
+        assert_allclose(d3dlo.from_output(same, config), T, atol=1e-9)
 
 
 # -------------------------------------------------------------------------------------------------------------- training
