@@ -1,6 +1,6 @@
 """Properties of D3DLO. Every expectation comes from an independent source: brute force, SciPy, a definition written out, or a closed
 form. Real data are optional: D3DLO_KITTI names a folder in KITTI odometry layout; without it those tests are skipped."""
-import argparse, json, math, os, pickle, re, runpy, shutil, signal, subprocess, sys, types, warnings, zipfile
+import argparse, contextlib, json, math, os, pickle, re, runpy, shutil, signal, subprocess, sys, warnings, zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -425,61 +425,43 @@ def test_augmented_pairs_still_fit_their_motion(seed):
     assert_array_equal(clouds["group"][..., 3], before["group"][..., 3])
 
 
-def fit(folder, config, resume=None, stop=None):
-    """Train on `drives()`; `stop` interrupts at the line that starts so. Returns the lines said."""
+def fit(folder, config, resume=None):
+    """Train on `drives()` until the end or an interruption. Returns the lines said."""
     said = []
-
-    def say(line):
-        said.append(line)
-        if stop and line.startswith(stop):
-            raise KeyboardInterrupt
     torch.manual_seed(0 if resume is None else 99)      # a resumed net must not depend on how it starts
-    try:
-        d3dlo.fit(D3DLO(config), *drives(), folder, 7, "cpu", resume, say)
-    except KeyboardInterrupt:
-        pass
+    with contextlib.suppress(KeyboardInterrupt):
+        d3dlo.fit(D3DLO(config), *drives(), folder, 7, "cpu", resume, said.append)
     return said
 
 
-@pytest.mark.parametrize("schedule, optimizer", [("steps", "adam"), ("one-cycle", "adam"), ("one-cycle", "muon")])
-def test_a_resumed_training_ends_in_the_same_weights(tmp_path, monkeypatch, schedule, optimizer):
-    config, clock = replace(SMALL, epochs=5, batch=4, schedule=schedule, optimizer=optimizer, augment=True), iter(range(0, 10 ** 9, 1000))
-    monkeypatch.setattr(d3dlo, "time", types.SimpleNamespace(monotonic=lambda: next(clock)))    # in a hurry: a checkpoint after each step
-    whole, part = fit(tmp_path / "whole", config), fit(tmp_path / "part", config, stop="epoch 3/")
-    state = torch.load(tmp_path / "part" / "checkpoint.pt", weights_only=True)
-    assert state["step"] == 8 and len(part) == 3        # of 15, in the middle of an epoch
-    assert fit(tmp_path / "part", config, resume=state) == whole[2:]
-    for name in ("checkpoint.pt", "weights.pt"):
-        a, b = (torch.load(tmp_path / folder / name, weights_only=True) for folder in ("whole", "part"))
-        assert a["step"] == b["step"] == 15 and all(torch.equal(tensor, b["model"][key]) for key, tensor in a["model"].items())
+@pytest.mark.parametrize("stop, stored, schedule, optimizer", [     # of 15 steps, in the middle of the eighth and of an epoch
+    (None, 7, "steps", "adam"), (None, 7, "one-cycle", "muon"),     # at once: there is only what was stored before
+    (signal.SIGINT, 8, "steps", "adam"), (signal.SIGTERM, 8, "one-cycle", "muon")])
+def test_a_stopped_training_goes_on_as_if_nothing_had_been_and_a_finished_one_stays(tmp_path, monkeypatch, stop, stored, schedule, optimizer):
+    config, steps, step = replace(SMALL, epochs=5, batch=4, schedule=schedule, optimizer=optimizer, augment=True), [], d3dlo.training_step
 
+    def step_with_a_stop(*arguments):
+        steps.append(1)
+        if len(steps) == 8 and not stop:
+            raise KeyboardInterrupt
+        if len(steps) == 8:
+            os.kill(os.getpid(), stop)
+        return step(*arguments)
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_training_finishes_its_step_and_goes_on_as_if_nothing_had_been(tmp_path, monkeypatch, number):
-    config, count, loss = replace(SMALL, epochs=5, batch=4, augment=True), [], d3dlo.loss_unweighted
-    whole = fit(tmp_path / "whole", config)
-
-    def loss_with_a_signal(*args):
-        count.append(1)
-        if len(count) == 5:                             # of 15, in the middle of a step and of an epoch
-            os.kill(os.getpid(), number)
-        return loss(*args)
-    monkeypatch.setattr(d3dlo, "loss_unweighted", loss_with_a_signal)
-    handlers = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    def load(folder, name):
+        return torch.load(tmp_path / folder / name, weights_only=True)
+    whole, handlers = fit(tmp_path / "whole", config), [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    monkeypatch.setattr(d3dlo, "training_step", step_with_a_stop)
+    monkeypatch.setattr(d3dlo, "STORE_EVERY", 0)        # a checkpoint after each step
     part = fit(tmp_path / "part", config)
-    assert handlers == (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) and len(count) == 5
-    state = torch.load(tmp_path / "part" / "checkpoint.pt", weights_only=True)
-    assert state["step"] == 5 and part + fit(tmp_path / "part", config, resume=state) == whole
-    a, b = (torch.load(tmp_path / folder / "weights.pt", weights_only=True)["model"] for folder in ("whole", "part"))
-    assert all(torch.equal(tensor, b[key]) for key, tensor in a.items())
-
-
-def test_resuming_a_finished_training_leaves_it_as_it_is(tmp_path):
-    fit(tmp_path, replace(SMALL, epochs=1))
-    before, weights = (torch.load(tmp_path / name, weights_only=True) for name in ("checkpoint.pt", "weights.pt"))
-    fit(tmp_path, replace(SMALL, epochs=1), resume=before)
-    after = torch.load(tmp_path / "weights.pt", weights_only=True)
-    assert after["step"] == 1 and all(torch.equal(tensor, after["model"][key]) for key, tensor in weights["model"].items())
+    monkeypatch.undo()
+    assert len(steps) == 8 and load("part", "checkpoint.pt")["step"] == stored
+    assert handlers == [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    for said in (part, whole[:-1]):                     # stopped; finished
+        assert said + fit(tmp_path / "part", config, load("part", "checkpoint.pt")) == whole
+        for name in ("checkpoint.pt", "weights.pt"):
+            a, b = load("whole", name), load("part", name)
+            assert a["step"] == b["step"] == 15 and all(torch.equal(tensor, b["model"][key]) for key, tensor in a["model"].items())
 
 
 # --------------------------------------------------------------------------------------------------------------- metrics
