@@ -525,14 +525,10 @@ def test_step_errors_are_what_was_put_in_wherever_the_estimate_starts(seed, n, s
     assert_allclose(metrics.step_errors(T, T_est), np.stack([np.linalg.norm(E[:, :3, 3], axis=1), angle], 1), atol=1e-9)
 
 
-def test_metrics_refuse_lengths_that_differ_and_print_nothing_as_a_dash(tmp_path, capsys):
-    for error in (metrics.segment_errors, metrics.step_errors, metrics.absolute_errors):
-        with pytest.raises(ValueError, match="20.*19"):
-            error(straight(20), straight(19))
-    assert np.isnan([metrics.kitti_errors([]), metrics.kitti_errors([metrics.segment_errors(straight(20), straight(20))])]).all()
-    metrics.write_poses(tmp_path / "a.txt", straight(20))
-    assert metrics.main([str(tmp_path / "a.txt")] * 2) == 0
-    assert capsys.readouterr().out.splitlines()[1].split()[:5] == ["a", "0", "-", "-", "0.0000"]
+@pytest.mark.parametrize("error", [metrics.segment_errors, metrics.step_errors, metrics.absolute_errors])
+def test_errors_refuse_lengths_that_differ(error):
+    with pytest.raises(ValueError, match="20.*19"):
+        error(straight(20), straight(19))
 
 
 @given(SEED, st.integers(1, 30))
@@ -1043,8 +1039,10 @@ def test_files_that_are_no_weights_are_named_in_one_line_and_run_no_code(here, c
 
 def test_metrics_on_the_command_line(here, capsys):
     gt, est = straight(300), straight(300, 1.01)
-    for name, T in {"gt/03": gt, "gt/07": gt, "est/03": est, "est/07": gt, "short": gt[:-1]}.items():
+    for name, T in {"gt/03": gt, "gt/07": gt, "est/03": est, "est/07": gt, "short": gt[:20]}.items():
         metrics.write_poses(f"{name}.txt", T)
+    assert metrics.main(["short.txt", "short.txt"]) == 0
+    assert figures(capsys.readouterr().out, "short")[:4] == ["0", "-", "-", "0.0000"]
     assert metrics.main(["gt/03.txt", "est/03.txt"]) == 0
     expected, out = devkit(gt, est)[:, 3], capsys.readouterr().out
     assert figures(out, "03")[:5] == [str(len(expected)), f"{expected.mean():.3f}", "0.00000", "0.0100", "0.0000"]
