@@ -329,26 +329,29 @@ def test_recomputed_statistics_are_the_plain_means_over_batches():
         assert norm.momentum == 1                       # as it was
 
 
-@given(SEED, st.sampled_from(["moving", "standing still", "opposite", "equal", "half standing"]), st.sampled_from([6, 7]), st.booleans(),
-       st.sampled_from([0.0, 0.1, 1.0]), st.sampled_from(["motion", "translation"]))
-def test_every_loss_is_what_it_says_and_has_finite_gradients(seed, kind, width, uncertainty, cosine, cosine_of):
-    rng, config = generator(seed), replace(VARIANTS["quaternion"] if width == 7 else SMALL, uncertainty=uncertainty, cosine=cosine, cosine_of=cosine_of)
-    y = torch.from_numpy(d3dlo.to_output(motion(rng, 0 if kind == "standing still" else (0.5, 0.2, 0.1, 0.5, 0.5, 2.0), n=5), config))
-    y_hat = {"moving": torch.from_numpy(rng.normal(size=(5, width))), "standing still": y * 0, "half standing": y * 0, "opposite": -y, "equal": y}[kind]
-    y_hat = y_hat.clone().requires_grad_()
+LOSSES = [{}, dict(cosine=1.0), dict(cosine=0.1, cosine_of="translation"), dict(uncertainty=True), dict(uncertainty=True, cosine=1.0)]
+
+
+@given(SEED, st.sampled_from([SMALL, VARIANTS["quaternion"]]), st.sampled_from(LOSSES),
+       st.sampled_from([0, 1]), st.sampled_from([-1, 0, 1]), st.sampled_from([0, 1]))
+@settings(max_examples=50)
+def test_every_loss_is_what_it_says_and_has_finite_gradients(seed, variant, changes, speed, answer, noise):
+    rng, config = generator(seed), replace(variant, **changes)
+    y = torch.from_numpy(d3dlo.to_output(motion(rng, speed, n=5), config))          # standing still, or moving
+    y_hat = (answer * y + noise * torch.from_numpy(rng.normal(size=y.shape))).requires_grad_()      # opposite, nothing, equal; somewhat else
     objective = d3dlo.Objective(config).double()
     weights = [w.data.normal_() for w in objective.parameters()]
     loss = objective(y_hat, y)
-    if width == 7:                                      # q and -q are one rotation: the nearer of the two counts
+    if y.shape[1] == 7:                                 # q and -q are one rotation: the nearer of the two counts
         flip = (y_hat[:, 3:] - y[:, 3:]).norm(dim=1) > (y_hat[:, 3:] + y[:, 3:]).norm(dim=1)
         y = torch.where(flip[:, None] & (torch.arange(7) > 2), -y, y)
     expected = F.l1_loss(y_hat, y)
-    if uncertainty:
+    if config.uncertainty:
         t, r = weights[0]
         expected = F.l1_loss(y_hat[:, :3], y[:, :3]) / t.exp() + t + F.l1_loss(y_hat[:, 3:], y[:, 3:]) / r.exp() + r
-    if cosine:
-        n = 3 if cosine_of == "translation" else width
-        expected = expected + cosine * (1 - F.cosine_similarity(y_hat[:, :n], y[:, :n])).mean()
+    if config.cosine:
+        n = 3 if config.cosine_of == "translation" else y.shape[1]
+        expected = expected + config.cosine * (1 - F.cosine_similarity(y_hat[:, :n], y[:, :n])).mean()
     torch.testing.assert_close(loss, expected, atol=1e-3, rtol=1e-3)            # the small number in eq. 5
     assert all(grad.isfinite().all() for grad in torch.autograd.grad(loss, [y_hat, *objective.parameters()]))
 
