@@ -34,6 +34,11 @@ LONELY = replace(SMALL, swap="random", sa3=Layer(0.1, 8, 4, (32, 32)))          
 generator = np.random.default_rng
 
 
+def table(arguments, cases):
+    """Parametrize by {name of the case: values}."""
+    return pytest.mark.parametrize(arguments, cases.values(), ids=cases)
+
+
 def cloud(rng, n):
     """A scan (n,4) in a flat box of 16 m."""
     return np.c_[rng.uniform(-8, 8, (n, 2)), rng.uniform(-2, 2, n), rng.random(n)].astype(np.float32)
@@ -284,7 +289,7 @@ def plain(net, b):
     return torch.cat([y[:, :3], y[:, 3:] / y[:, 3:].norm(dim=1, keepdim=True)], 1) if y.shape[1] == 7 else y, statistics
 
 
-@pytest.mark.parametrize("config", [SMALL, *VARIANTS.values(), LONELY])
+@table("config", {"Table 1, small": SMALL, **VARIANTS, "lonely": LONELY})
 @pytest.mark.parametrize("training", [True, False])
 @given(seed=SEED)
 def test_the_network_is_equations_3_and_4(training, config, seed):
@@ -338,7 +343,7 @@ LOSSES = [{}, dict(cosine=1.0), dict(cosine=0.1, cosine_of="translation"), dict(
 def test_every_loss_is_what_it_says_and_has_finite_gradients(seed, variant, changes, speed, answer, noise):
     rng, config = generator(seed), replace(variant, **changes)
     y = torch.from_numpy(d3dlo.to_output(motion(rng, speed, n=5), config))          # standing still, or moving
-    y_hat = (answer * y + noise * torch.from_numpy(rng.normal(size=y.shape))).requires_grad_()      # opposite, nothing, equal; somewhat else
+    y_hat = (answer * y + noise * torch.from_numpy(rng.normal(size=y.shape))).requires_grad_()      # opposite, nothing, equal; other
     objective = d3dlo.Objective(config).double()
     weights = [w.data.normal_() for w in objective.parameters()]
     loss = objective(y_hat, y)
@@ -372,7 +377,8 @@ def test_sixteen_pairs_can_be_learned_by_heart(tmp_path):
     torch.manual_seed(0)
     net = d3dlo.fit(D3DLO(config), geometry, motions, tmp_path, 0, "cpu", say=said.append)
     in_training, in_use = map(float, re.findall(r"([\d.]+) in \w+ mode", said[-1]))
-    assert float(re.search(r"loss ([\d.]+)", said[0])[1]) > 0.3 and in_training < 0.02 and in_use < 0.02         # eq. 2, m and degrees alike
+    before = float(re.search(r"loss ([\d.]+)", said[0])[1])
+    assert before > 0.3 and in_training < 0.02 and in_use < 0.02                    # eq. 2, m and degrees alike
     got = to_vector(np.concatenate([d3dlo.predict_motions(net, records) for records in geometry]))
     assert np.abs(got - to_vector(np.concatenate(motions))).mean() < 0.02           # and by the path that odometry takes
 
@@ -436,7 +442,7 @@ def fit(folder, config, resume=None):
 @pytest.mark.parametrize("stop, stored, schedule, optimizer", [     # of 15 steps, in the middle of the eighth and of an epoch
     (None, 7, "steps", "adam"), (None, 7, "one-cycle", "muon"),     # at once: there is only what was stored before
     (signal.SIGINT, 8, "steps", "adam"), (signal.SIGTERM, 8, "one-cycle", "muon")])
-def test_a_stopped_training_goes_on_as_if_nothing_had_been_and_a_finished_one_stays(tmp_path, monkeypatch, stop, stored, schedule, optimizer):
+def test_a_stopped_training_goes_on_as_if_nothing_had_been_a_finished_one_stays(tmp_path, monkeypatch, stop, stored, schedule, optimizer):
     config, steps, step = replace(SMALL, epochs=5, batch=4, schedule=schedule, optimizer=optimizer, augment=True), [], d3dlo.training_step
 
     def step_with_a_stop(*arguments):
@@ -500,7 +506,7 @@ for file in (OFFICIAL / f"{name}.txt" for name in ("04", "07", "10")):
         DRIVES[f"official {file.stem}"] = lambda rng, n, T=metrics.read_poses(file): T[:n]
 
 
-@pytest.mark.parametrize("drive", DRIVES.values(), ids=DRIVES)
+@table("drive", DRIVES)
 @given(seed=SEED, n=st.integers(2, 450), size=st.sampled_from([0, 1e-5, 0.02, 20]))
 def test_errors_of_segments_are_the_devkits_and_those_of_steps_what_was_put_in(drive, seed, n, size):
     rng = generator(seed)
@@ -537,7 +543,8 @@ def test_remove_plane_takes_the_ground_and_leaves_the_box(seed, roll, pitch):
     box = np.c_[rng.uniform(-8, 8, (1500, 2)), rng.uniform(0.4, 3, 1500), rng.random(1500)]
     scan, order = moved_scan(by_hand(np.array([0, 0, -1.7, roll, pitch, 0])), np.r_[ground, box]), rng.permutation(4502)
     scan = np.r_[scan, np.full((2, 4), np.nan, np.float32)][order]
-    assert_array_equal(kitti.remove_plane(scan, seed=seed), scan[order >= 3000])        # all of the ground, nothing else, the order kept, NaN too
+    left = scan[order >= 3000]                          # all of the ground goes, nothing else; the order stays, and NaN too
+    assert_array_equal(kitti.remove_plane(scan, seed=seed), left)
 
 
 @pytest.mark.parametrize("N, thick", [(0, 0), (2, 0), (500, 0), (5000, 0.1)])
@@ -666,12 +673,12 @@ def test_temporaries_of_dead_processes_go_and_those_of_living_ones_stay(tmp_path
 
 def save_weights(path, config=Config(), seen=([1.0, 0.1, 1.0, 0.01], [1e6, 1.0, 100.0, 1.0])):
     """A file as `fit` writes it, of a network that was never trained."""
-    net = a_net(generator(0), config)
-    d3dlo.save(path, config=config.as_dict(), model=net.state_dict(), step=0, train={}, before=[], mean_motion=[1.0, 0, 0, 0, 0, 0], seen=seen)
+    net, remember = a_net(generator(0), config), dict(train={}, before=[], mean_motion=[1.0, 0, 0, 0, 0, 0], seen=seen)
+    d3dlo.save(path, config=config.as_dict(), model=net.state_dict(), step=0, **remember)
     return net
 
 
-@pytest.mark.parametrize("config", [SMALL, replace(SMALL, batch=3, swap="random", sa1=Layer(1.5, 40, 5, (6, 10))), *VARIANTS.values(), Config()])
+@table("config", {**VARIANTS, "small": replace(SMALL, batch=3, swap="random", sa1=Layer(1.5, 40, 5, (6, 10))), "default": Config()})
 def test_weights_rebuild_their_network_from_the_file_itself(tmp_path, config):
     net, rng = save_weights(tmp_path / "weights.pt", config), generator(0)
     p, q = cloud(rng, 1100), cloud(rng, 1100)
@@ -721,18 +728,15 @@ def test_refining_answers_both_ways_and_again_for_what_is_left(seed):
         assert_allclose(T, expected, atol=1e-3)
 
 
-SCENES = {  # scans (N,4) of which the default network must make a finite motion
+@pytest.mark.filterwarnings("ignore")
+@table("scene", {       # scans (N,4) of which the default network must make a rigid motion
     "an empty field": lambda rng: np.c_[rng.uniform(-50, 50, (5000, 2)), np.full(5000, -1.73), np.full(5000, 0.3)],
     "a corridor": lambda rng: np.c_[rng.uniform(-80, 80, 5000), rng.choice([-2, 2], 5000), rng.uniform(-1, 2, 5000), np.full(5000, 0.3)],
     "exactly 1,024 points": lambda rng: cloud(rng, 1024),
     "all points at one place": lambda rng: np.ones((2000, 4)),
     "all points at the sensor": lambda rng: np.zeros((2000, 4)),
     "1,000,000 points": lambda rng: cloud(rng, 1_000_000),
-}
-
-
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
+})
 def test_degenerate_scenes_end_in_a_rigid_motion(tmp_path, scene):
     save_weights(tmp_path / "w.pt")
     p = scene(generator(0)).astype(np.float32)
@@ -807,8 +811,9 @@ def test_eval_writes_what_it_prints_and_metrics_agrees_and_zips_what_the_server_
     assert d3dlo.main(["eval", "--data", "root", "--weights", str(weights), "--out", "out"]) == 0
     out, err = capsys.readouterr()
     results, (net, _) = json.loads((here / "out" / "results.json").read_text()), load_weights(weights)
-    assert complaint(err) == [] and sorted(os.listdir("out")) == ["03.txt", "07.txt", *(f"{name}.txt" for name in server), "kitti-server.zip", "results.json"]
-    assert list(results["sequences"]) == ["03", "07", *server] and set(results["pooled"]) == {"test", "validation", "all"}
+    names = ["03", "07", *server]
+    assert complaint(err) == [] and sorted(os.listdir("out")) == [*(f"{name}.txt" for name in names), "kitti-server.zip", "results.json"]
+    assert list(results["sequences"]) == names and set(results["pooled"]) == {"test", "validation", "all"}
     for name, s in [*results["sequences"].items(), ("all", results["pooled"]["all"]["network"])]:
         assert figures(out, name) == as_printed(s) and s["trained_on"] is False
     assert results["sequences"]["11"]["E_t"] is None
@@ -874,7 +879,9 @@ def rewrite(name, change):
 
 
 SCAN, POSES, CALIB = "sequences/00/velodyne/000005.bin", "poses/00.txt", "sequences/00/calib.txt"
-BAD_DATA = {    # what is done to a good root, and what the complaint must name
+
+
+@table("spoil, words", {        # what is done to a good root, and what the complaint must name
     "no sequences": (lambda root: shutil.rmtree(root / "sequences"), "sequences/"),
     "raw layout": (lambda root: (root / "sequences").rename(root / "2011_09_26_drive_0005_sync"), "raw data"),
     "no scans": (lambda root: shutil.rmtree((root / SCAN).parent), "velodyne"),
@@ -895,10 +902,7 @@ BAD_DATA = {    # what is done to a good root, and what the complaint must name
     "no calibration": (lambda root: (root / CALIB).unlink(), CALIB),
     "calibration without Tr": (rewrite(CALIB, lambda b: b.partition(b"Tr")[0]), CALIB),
     "Tr of 11": (rewrite(CALIB, lambda b: b.rstrip().rpartition(b" ")[0]), CALIB),
-}
-
-
-@pytest.mark.parametrize("spoil, words", BAD_DATA.values(), ids=BAD_DATA)
+})
 def test_bad_data_is_named_in_one_line_and_leaves_nothing_behind(here, weights, capsys, spoil, words):
     spoil(root := write_root(here / "root"))
     fails_with_one_line(d3dlo.main, ["eval", "--data", root, "--weights", weights, "--out", "out"], words, capsys)
@@ -906,16 +910,13 @@ def test_bad_data_is_named_in_one_line_and_leaves_nothing_behind(here, weights, 
     assert [name for name in files_of(here) if not name.startswith("root/")] == []
 
 
-BAD_ARGUMENTS = {  # and what the complaint must name; without --data there is the simulated city
+@pytest.mark.parametrize("arguments, words", {       # and what the complaint must name; without --data there is the simulated city
     "eval --data root --sequences 42": "42", "eval --data root --sequences ../sequences/00": "../sequences/00", "eval --data gone": "gone",
     "eval --data root --weights gone.pt": "gone.pt", "eval --data root --weights root": "root/weights.pt", "eval --sequences 0O": "0O",
     "eval --data root --device nonsense": "nonsense", "train --resume": "--out", "train --resume --out gone": "gone",
     "train --data root --sequences test": "test", "train --sequences 00 0O": "0O", "train --data root --weights gone.pt": "gone.pt",
     "train --data root --weights gone.pt --no-plane": "--no-plane", "train --data root --lr 0": "lr",
-}
-
-
-@pytest.mark.parametrize("arguments, words", BAD_ARGUMENTS.items())
+}.items())
 def test_bad_arguments_are_named_in_one_line(here, capsys, arguments, words):
     write_root(here / "root")
     before = sorted(here.rglob("*"))
@@ -933,16 +934,13 @@ def torch_bytes(content):
     return Path("content.pt").read_bytes()
 
 
-BAD_WEIGHTS = {     # the bytes of a good file -> those of a bad one
+@table("spoil", {       # the bytes of a good file -> those of a bad one
     "another shape": lambda good: torch_bytes({**torch.load("good.pt"), "config": Config().as_dict()}),
     "other numbers": lambda good: torch_bytes((state := torch.load("good.pt")) | {"model": {k: v + 1 for k, v in state["model"].items()}}),
     "code": lambda good: pickle.dumps(Mischief(), protocol=2), "code by torch": lambda good: torch_bytes({"model": Mischief()}),
     "cut short": lambda good: good[:-2000], "no config": lambda good: torch_bytes({"model": {}}), "a list": lambda good: torch_bytes([1.0]),
     "noise": lambda good: generator(0).bytes(5000), "empty": lambda good: b"", "text": lambda good: b"hello",
-}
-
-
-@pytest.mark.parametrize("spoil", BAD_WEIGHTS.values(), ids=BAD_WEIGHTS)
+})
 def test_files_that_are_no_weights_are_named_in_one_line_and_run_no_code(here, capsys, spoil):
     write_root(here / "root", size=40)
     save_weights("good.pt", SMALL)
@@ -1022,7 +1020,8 @@ def test_the_readme_s_python_runs_and_its_commands_parse(here, monkeypatch):
     text = (HERE / "README.md").read_text(encoding="utf-8")
     for block in re.findall(r"```python\n(.*?)```", text, re.S):
         exec(compile(block, "README.md", "exec"), {})
-    commands = re.findall(r"^(?:pip install \S+ && )?python (\S+\.py)([^#\n]*)", text, re.M) + re.findall(r"`python (\S+\.py)([^`]*)`", text)
+    commands = re.findall(r"^(?:pip install \S+ && )?python (\S+\.py)([^#\n]*)", text, re.M)
+    commands += re.findall(r"`python (\S+\.py)([^`]*)`", text)
     assert len(commands) > 12
     monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse_only)
     for script, arguments in commands:
