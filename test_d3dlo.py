@@ -30,7 +30,6 @@ SMALL = Config(sa1=Layer(2.0, 32, 4, (4, 8, 16)), fe=Layer(None, None, 6, (16, 3
                sa3=Layer(8.0, 8, 4, (32, 32)), mpn=Layer(None, None, None, (32, 64)), mlp=Layer(None, None, None, (32, 6)))
 VARIANTS = {"coordinates": replace(SMALL, coordinates=True), "quaternion": replace(SMALL, mlp=Layer(None, None, None, (32, 7))),
             "scales": replace(SMALL, scales=(Layer(4.0, None, 3, (6, 10)), Layer(1.0, None, 2, (8, 8))))}
-LONELY = replace(SMALL, swap="random", sa3=Layer(0.1, 8, 4, (32, 32)))              # every ball of SA3 holds its centroid alone
 generator = np.random.default_rng
 
 
@@ -191,9 +190,6 @@ def by_hand(v):
     return np.block([[np.array(Rz) @ Ry @ Rx, np.reshape(v[:3], (3, 1))], [np.array([0, 0, 0, 1])]])
 
 
-DEGREES = st.floats(-179.9, 179.9)
-
-
 @given(SEED, st.lists(st.integers(0, 5), max_size=3))
 @settings(max_examples=100)
 def test_vectors_are_extrinsic_xyz_of_any_leading_shape_and_survive_the_round_trip(seed, shape):
@@ -204,9 +200,10 @@ def test_vectors_are_extrinsic_xyz_of_any_leading_shape_and_survive_the_round_tr
     assert_allclose(invert(T), np.linalg.inv(T), atol=1e-11)
 
 
-@given(DEGREES, st.sampled_from([90, -90]), st.sampled_from([0, 1e-12, 1e-9, 1e-7, 1e-5, 1e-3, 0.1]), DEGREES)
+@given(SEED, st.sampled_from([90, -90]), st.sampled_from([0, 1e-12, 1e-9, 1e-7, 1e-5, 1e-3, 0.1]))
 @settings(max_examples=150)
-def test_motions_survive_the_round_trip_at_gimbal_lock_without_a_warning(roll, pole, off, yaw):
+def test_motions_survive_the_round_trip_at_gimbal_lock_without_a_warning(seed, pole, off):
+    roll, yaw = generator(seed).uniform(-179.9, 179.9, 2)
     T = by_hand(np.array([1, 2, 3, roll, pole - np.sign(pole) * off, yaw]))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -289,7 +286,7 @@ def plain(net, b):
     return torch.cat([y[:, :3], y[:, 3:] / y[:, 3:].norm(dim=1, keepdim=True)], 1) if y.shape[1] == 7 else y, statistics
 
 
-@table("config", {"Table 1, small": SMALL, **VARIANTS, "lonely": LONELY})
+@table("config", {"small": SMALL, **VARIANTS, "centroids alone": replace(SMALL, swap="random", sa3=Layer(0.1, 8, 4, (32, 32)))})
 @pytest.mark.parametrize("training", [True, False])
 @given(seed=SEED)
 def test_the_network_is_equations_3_and_4(training, config, seed):
@@ -334,11 +331,9 @@ def test_recomputed_statistics_are_the_plain_means_over_batches():
         assert norm.momentum == 1                       # as it was
 
 
-LOSSES = [{}, dict(cosine=1.0), dict(cosine=0.1, cosine_of="translation"), dict(uncertainty=True), dict(uncertainty=True, cosine=1.0)]
-
-
-@given(SEED, st.sampled_from([SMALL, VARIANTS["quaternion"]]), st.sampled_from(LOSSES),
-       st.sampled_from([0, 1]), st.sampled_from([-1, 0, 1]), st.sampled_from([0, 1]))
+@given(SEED, st.sampled_from([SMALL, VARIANTS["quaternion"]]), st.sampled_from([
+    {}, dict(cosine=1.0), dict(cosine=0.1, cosine_of="translation"), dict(uncertainty=True), dict(uncertainty=True, cosine=1.0)]),
+    st.sampled_from([0, 1]), st.sampled_from([-1, 0, 1]), st.sampled_from([0, 1]))
 @settings(max_examples=50)
 def test_every_loss_is_what_it_says_and_has_finite_gradients(seed, variant, changes, speed, answer, noise):
     rng, config = generator(seed), replace(variant, **changes)
@@ -500,10 +495,8 @@ def straight(n, step=1.0):
     return T
 
 
-DRIVES = {"winding": lambda rng, n: trajectory(rng, n), "straight": lambda rng, n: straight(n, 2.5)}   # on which 100 m end in a frame
-for file in (OFFICIAL / f"{name}.txt" for name in ("04", "07", "10")):
-    if file.is_file():
-        DRIVES[f"official {file.stem}"] = lambda rng, n, T=metrics.read_poses(file): T[:n]
+DRIVES = {"winding": trajectory, "straight": lambda rng, n: straight(n, 2.5)}       # on a straight one 100 m end in a frame
+DRIVES |= {f"official {file.stem}": lambda rng, n, T=metrics.read_poses(file): T[:n] for file in OFFICIAL.glob("0[47].txt")}
 
 
 @table("drive", DRIVES)
