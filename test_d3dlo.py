@@ -43,8 +43,8 @@ def cloud(rng, n):
     return np.c_[rng.uniform(-8, 8, (n, 2)), rng.uniform(-2, 2, n), rng.random(n)].astype(np.float32)
 
 
-def motion(rng, scale=(0.5, 0.2, 0.1, 0.5, 0.5, 2.0), n=()):
-    return from_vector(rng.normal(size=(*np.atleast_1d(n).astype(int), 6)) * scale)
+def motion(rng, scale=(0.5, 0.2, 0.1, 0.5, 0.5, 2.0), n=None):
+    return from_vector(rng.normal(size=6 if n is None else (n, 6)) * scale)
 
 
 def trajectory(rng, n, scale=(2.5, 0.3, 0.1, 0.3, 0.3, 3.0)):
@@ -66,11 +66,11 @@ def pairs_of_scans(rng, n, points=64, config=SMALL):
     return [np.stack([scan_geometry(s, config) for s in pair]) for pair in scans], list(motions[:, None])
 
 
-def drives(scans=6):
-    """Two sequences of unrelated scans, for whatever does not ask what is learned."""
+def drives():
+    """Two sequences of six unrelated scans, for whatever does not ask what is learned."""
     rng = generator(0)
-    geometry = [np.stack([scan_geometry(cloud(rng, 48), SMALL) for _ in range(scans)]) for _ in range(2)]
-    return geometry, [motion(rng, n=scans - 1) for _ in range(2)]
+    geometry = [np.stack([scan_geometry(cloud(rng, 48), SMALL) for _ in range(6)]) for _ in range(2)]
+    return geometry, [motion(rng, n=5) for _ in range(2)]
 
 
 def a_batch(rng, config=SMALL, pairs=3):
