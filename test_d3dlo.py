@@ -437,7 +437,7 @@ def fit(folder, config, resume=None):
 @pytest.mark.parametrize("stop, stored, schedule, optimizer", [     # of 15 steps, in the middle of the eighth and of an epoch
     (None, 7, "steps", "adam"), (None, 7, "one-cycle", "muon"),     # at once: there is only what was stored before
     (signal.SIGINT, 8, "steps", "adam"), (signal.SIGTERM, 8, "one-cycle", "muon")])
-def test_a_stopped_training_goes_on_as_if_nothing_had_been_a_finished_one_stays(tmp_path, monkeypatch, stop, stored, schedule, optimizer):
+def test_a_training_goes_on_as_if_never_stopped_and_a_finished_one_stays(tmp_path, monkeypatch, stop, stored, schedule, optimizer):
     config, steps, step = replace(SMALL, epochs=5, batch=4, schedule=schedule, optimizer=optimizer, augment=True), [], d3dlo.training_step
 
     def step_with_a_stop(*arguments):
