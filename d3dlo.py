@@ -69,6 +69,7 @@ class Config:
     schedule: str = "steps"     # x0.1 (ours) at 3/5 and 4/5 of the epochs, 300 and 400 of 500; "one-cycle": torch's OneCycleLR
     swap: str = "both"          # ours: "both" directions of every pair in a batch; "random": one of them, as in section 4; "off": forward
     augment: bool = False       # ours: mirror pairs and move Q by small random motions
+    frozen: float = 0.0         # ours: share of the steps, the last ones, in which BatchNorm's statistics stay as they are
 
     # what the paper tried and left; with a 7 in place of mlp's 6 the rotation is a quaternion (section 3.2)
     cosine: float = 0.0         # weight of the cosine distance, eq. 5, in the loss
@@ -92,6 +93,8 @@ class Config:
             raise ValueError("Config: epochs, batch, spread and every n_n must be 1 or more")
         if not (0 < self.lr < math.inf and 0 < self.max_range < math.inf):
             raise ValueError("Config: lr and max_range must be above 0")
+        if not 0 <= self.frozen < 1:
+            raise ValueError("Config: frozen is a share, from 0 to below 1")
         if len(self.mlp.mlp) != 2 or self.mlp.mlp[1] not in (6, 7):
             raise ValueError("Config: mlp has two layers, the last of 6 outputs (Euler angles) or 7 (quaternion)")
         for name, choices in (("optimizer", ("adam", "muon")), ("schedule", ("steps", "one-cycle")), ("swap", ("both", "random", "off")),
@@ -104,7 +107,7 @@ class Config:
         return json.loads(json.dumps(asdict(self)))
 
 
-SHORT = dict(epochs=9, batch=8, optimizer="muon", lr=1e-2, schedule="one-cycle", augment=True)         # in 10 minutes on the simulated city
+SHORT = dict(epochs=9, batch=8, optimizer="muon", lr=1e-2, schedule="one-cycle", augment=True, frozen=0.25)     # in 10 minutes on the simulated city
 
 
 # ------------------------------------------------------------------------------------ sections 3.1, 3.2: problem and objective
@@ -730,23 +733,19 @@ def schedule(optimizer, config, steps):
     return torch.optim.lr_scheduler.MultiStepLR(optimizer, [max(1, steps * 3 // 5), max(1, steps * 4 // 5)], gamma=0.1)
 
 
-def recompute_statistics(net, examples, objective=loss_unweighted):
+@torch.no_grad()
+def recompute_statistics(net, examples):
     """BatchNorm's running averages lag behind the weights; replace them by the plain mean over these examples (Batch,
-    target), weights fixed. Returns the mean loss over them in training mode."""
+    target), weights fixed."""
     momenta = {m: m.momentum for m in net.modules() if isinstance(m, nn.modules.batchnorm._BatchNorm)}
     for norm in momenta:
         norm.reset_running_stats()
         norm.momentum = None
-    loss = mean_loss(net.train(), examples, objective)
+    net.train()
+    for batch, _ in examples:
+        net(batch)
     for norm, momentum in momenta.items():
         norm.momentum = momentum
-    return loss
-
-
-@torch.no_grad()
-def mean_loss(net, examples, objective=loss_unweighted):
-    """Mean of the objective over examples (Batch, target), in the mode the network is in."""
-    return float(np.mean([objective(net(batch), target).item() for batch, target in examples]))
 
 
 def save(path, model, **state):
@@ -786,12 +785,16 @@ def parts_of(net, steps, device="cpu"):
 
 
 def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=print, **remember):
-    """Train `net` as its config says (section 4). Returns a net for use, with BatchNorm's statistics recomputed.
+    """Train `net` as its config says (section 4). Returns a net for use, in eval mode.
+
+    For that BatchNorm's statistics are recomputed: at the end, or before the last steps, of which config.frozen is the share. Then these train
+    the weights as they will be used, without the noise of a batch's statistics.
 
     Every STORE_EVERY seconds and at the end writes RUN/checkpoint.pt, whose content `resume` goes on from, and RUN/weights.pt, the net for use,
     with `remember` in both. When interrupted finishes its step, writes the checkpoint and raises KeyboardInterrupt."""
     config, per_epoch, run = net.config, steps_per_epoch(motions, net.config), Path(run)
     total = config.epochs * per_epoch
+    frozen_from = round(total * (1 - config.frozen))
     parts = parts_of(net, total, device)
     _, objective, *minimizers = parts.values()              # the last are the optimisers and their schedules
     step, losses = 0, []
@@ -799,10 +802,9 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
         step, losses = resume["step"], resume["losses"]
         for name, part in parts.items():
             part.load_state_dict(resume[name])
-    enough = min(25, total)     # batches for the statistics, and to compare both modes on
 
     def fixed_batches():        # drawn like those of the training, by random numbers of their own
-        return batches(geometry, motions, config, (seed, 2 ** 31), 0, enough, device)
+        return batches(geometry, motions, config, (seed, 2 ** 31), 0, min(25, total), device)
 
     def store_checkpoint():
         save(run / "checkpoint.pt", config=config.as_dict(), step=step, losses=losses, **remember,
@@ -810,15 +812,18 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
 
     def store_weights():
         usable = copy.deepcopy(net)
-        loss = recompute_statistics(usable, fixed_batches(), objective)
+        if step <= frozen_from:
+            recompute_statistics(usable, fixed_batches())
         save(run / "weights.pt", config=config.as_dict(), step=step, **remember, model=usable.state_dict())
-        return usable, loss
+        return usable.eval()
 
     stored = time.monotonic()
     todo = batches(geometry, motions, config, (seed,), step, total, device)
     with interruption_waits() as came:
         for batch, target in progress(todo, total - step, f"training, batches of {config.batch} pairs, swap: {config.swap}"):
-            loss, rate = objective(net.train()(batch), target), minimizers[0].param_groups[0]["lr"]
+            if step == frozen_from:
+                recompute_statistics(net, fixed_batches())
+            loss, rate = objective(net.train(step < frozen_from)(batch), target), minimizers[0].param_groups[0]["lr"]
             net.zero_grad()
             objective.zero_grad()
             loss.backward()
@@ -838,9 +843,10 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
         store_checkpoint()
         if came:
             raise KeyboardInterrupt(f"step {step} is stored; python d3dlo.py train --out {run} --resume goes on from it")
-    usable, loss_train = store_weights()
-    loss_eval = mean_loss(usable.eval(), fixed_batches(), objective)
-    say(f"loss over {enough} batches, weights fixed: {loss_train:.4f} in train mode, {loss_eval:.4f} in eval mode")
+    usable = store_weights()
+    with torch.no_grad():
+        loss = np.mean([objective(usable(batch), target).item() for batch, target in fixed_batches()])
+    say(f"loss in eval mode, as it is used: {loss:.4f}, over some batches of the training")
     return usable
 
 
