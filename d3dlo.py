@@ -45,7 +45,7 @@ class Layer(NamedTuple):
     r: float | None         # radius of the ball [m]
     n_fps: int | None       # centroids kept by farthest point sampling
     n_n: int | None         # neighbours of a centroid
-    mlp: tuple              # output widths of its layers: four in sa1, and not from 4 to 8 to 16 to 32. Only so are there 61,290 parameters
+    mlp: tuple              # output width of every linear layer: sa1's [4, 8, 16, 32] are four, 4 inputs -> 4 -> 8 -> 16 -> 32, else not 61,290
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Config:
     mpn: Layer = Layer(None, None, None, (64, 256))
     mlp: Layer = Layer(None, None, None, (64, 6))
 
-    spread: int = 1             # ours: which n_n of a ball: the nearest, or in even steps of the nearest spread * n_n
+    spread: int = 1             # ours: which n_n points of a ball: the nearest; with 2 about every second of the nearest 2 n_n, and so on
     max_range: float = 50.0     # m; ours: what is further is left out. Spread over 80 m, 1,024 centroids lie too far apart for Table 1's balls
     plane: bool = True          # keep the points of the ground plane, Table 2's "pp"
     epochs: int = 500           # section 4
@@ -69,14 +69,14 @@ class Config:
     schedule: str = "steps"     # x0.1 (ours) at 3/5 and 4/5 of the epochs, 300 and 400 of 500; "one-cycle": torch's OneCycleLR
     swap: str = "both"          # ours: "both" directions of every pair in a batch; "random": one of them, as in section 4; "off": forward
     augment: bool = False       # ours: mirror pairs and move Q by small random motions
-    frozen: float = 0.0         # ours: share of the steps, the last ones, in which BatchNorm's statistics stay as they are
+    frozen: float = 0.0         # ours: the last share of the steps, trained with BatchNorm's statistics fixed
+    coordinates: bool = False   # ours, and DeepCLR's: the mini-PointNet sees where its 64 points are. 61,482 parameters
 
     # what the paper tried and left; with a 7 in place of mlp's 6 the rotation is a quaternion (section 3.2)
     cosine: float = 0.0         # weight of the cosine distance, eq. 5, in the loss
     cosine_of: str = "motion"   # or "translation", that alone
     uncertainty: bool = False   # section 3.2: homoscedastic uncertainty weighs translation and rotation
-    scales: tuple = ()          # section 3.3.2: further Layers of SA1 on its centroids, multi-scale grouping; n_fps as in sa1
-    coordinates: bool = False   # not in the paper, but DeepCLR's: the mini-PointNet sees where its 64 points are. 61,482 parameters
+    scales: tuple = ()          # section 3.3.2, multi-scale grouping: further Layers for SA1, on the same centroids (their n_fps is ignored)
 
     def __post_init__(self):
         def layer(r, n_fps, n_n, mlp):                          # json turns tuples into lists; turn them back
@@ -146,7 +146,7 @@ SPACED = np.array([int(f"{i:b}", 4) for i in range(256)], np.uint16)        # th
 
 def _side_by_side(xyz):
     """(N,3) -> (N,) indices, neighbours near each other: a Z-order curve over azimuth and the logarithm of the range, by which the points
-    of a LiDAR are about evenly dense. It takes a third of a tree's time."""
+    of a LiDAR are about evenly dense. The order of a tree would serve too, but takes three times as long."""
     x, y = xyz[:, 0], xyz[:, 1]
     with np.errstate(all="ignore"):                         # any order is right, this one is only quick
         azimuth, radius = np.arctan2(y, x), np.log(np.hypot(x, y) + 1)
@@ -210,7 +210,7 @@ def group_knn(xyz: np.ndarray, query: np.ndarray, k: int) -> np.ndarray:
     return np.where(idx == len(xyz), idx[:, :1], idx)
 
 
-GEOMETRY = 3    # raise when scan_geometry changes, so that older caches are not read
+GEOMETRY = 3    # one more when scan_geometry changes, so that older caches are not read
 # what tells one kind of scans from another, to say when weights meet a kind they were not trained on
 LOOKS = "usable points", "mean intensity", "median range of the centroids [m]", "share of points in the fullest 0.3 m of height, the ground"
 
@@ -359,7 +359,7 @@ def make_batch(clouds, p, q, config, device="cpu"):
 # --------------------------------------------------------------------------------------------- section 3.3: the network (torch)
 
 class GatherAdd(torch.autograd.Function):
-    """u (B,n,D), v (B,S,D), idx (B,S,k) -> u[b, idx] + v[:, :, None] (B,S,k,D), with its way back written out: on a CPU it takes half
+    """u (B,n,D), v (B,S,D), idx (B,S,k) -> u[b, idx] + v[:, :, None] (B,S,k,D), with its backward pass written out: on a CPU it takes half
     as long as torch's own of gather, and less than that of indexing."""
 
     @staticmethod
@@ -380,7 +380,7 @@ class GatherAdd(torch.autograd.Function):
 class LinearMax(torch.autograd.Function):
     """h (B,S,k,D), W (D',D) -> max over k of h W^T (B,S,D'), and with `moments` E[h] (D,) and E[h^T h] (D,D) over all B*S*k rows.
 
-    One element of the batch at a time, and again on the way back, so that the largest tensors of the network, (B,S,k,D') and its
+    One element of the batch at a time, and again in the backward pass, so that the largest tensors of the network, (B,S,k,D') and its
     gradient, never exist in full: memory traffic is what a CPU waits for. Equal maxima share the gradient, as in torch.amax."""
 
     @staticmethod
@@ -407,10 +407,15 @@ class LinearMax(torch.autograd.Function):
         for b, rows in enumerate(h.reshape(B, S * k, D)):
             torch.mm(rows, W.t(), out=z)
             torch.eq(is_max, out[b][:, None], out=is_max)
-            is_max.mul_((grad[b] / is_max.sum(1).clamp_(min=1))[:, None])                 # 0 only of NaN
+            is_max.mul_((grad[b] / is_max.sum(1).clamp_(min=1))[:, None])                 # 0 only where all is NaN
             grad_W.addmm_(z.t(), rows)
             torch.addmm(constant, rows, slope, out=grad_h[b].view(S * k, D)).addmm_(z, W)
         return grad_h, grad_W, None
+
+
+def norm_relu(norm, z):
+    """ReLU(BN(z)) over the last axis of z (B,S,k,D). Seen as (B,D,S,k) it is channels-last, for which torch is fast."""
+    return F.relu_(norm(z.permute(0, 3, 1, 2))).permute(0, 2, 3, 1)
 
 
 def linear_norm_relu_max(linear, norm, h):
@@ -451,9 +456,9 @@ class MiniPointNet(nn.Module):
 
     def rest(self, z):
         """All that follows the first linear layer, from its output (B,S,k,D1)."""
-        for i, norm in enumerate(self.norms[:-1]):
-            z = self.linears[i](h) if i else z
-            h = F.relu_(norm(z.permute(0, 3, 1, 2))).permute(0, 2, 3, 1)       # (B,D,S,k) so seen is channels-last, for which torch is fast
+        h = norm_relu(self.norms[0], z)
+        for linear, norm in zip(self.linears[1:-1], self.norms[1:-1]):
+            h = norm_relu(norm, linear(h))
         return linear_norm_relu_max(self.linears[-1], self.norms[-1], h)
 
 
@@ -513,7 +518,7 @@ class D3DLO(nn.Module):
         p, q, (n2, n3) = batch.p, batch.q, (batch.idx2.shape[1], batch.idx3.shape[1])
         groups = batch.group.split([scale.n_n for scale in (self.config.sa1, *self.config.scales)], 2)         # neighbours come gathered
         feat = torch.cat([sa.h(group) for sa, group in zip((self.sa1, *self.scales), groups)], 2)              # (C,1024,32), eq. 3
-        feat_p, feat_q = feat.index_select(0, p), feat.index_select(0, q)                      # feat[p] is slow on the way back
+        feat_p, feat_q = feat.index_select(0, p), feat.index_select(0, q)                      # feat[p] has a slow backward pass
         xyz = batch.xyz[p]                                                                     # (B,1024,3)
         flow = self.fe(xyz, feat_p, batch.xyz[q], feat_q, batch.idx_fe)                        # (B,1024,64)
         flow = self.sa2(xyz, flow, batch.idx2[p])                                              # (B,256,64)
@@ -528,7 +533,7 @@ class D3DLO(nn.Module):
 # ------------------------------------------------------------- sections 3.4, 3.2: what the paper tried beside eq. 2, off by default
 
 def cosine_distance(y_hat, y):
-    """Eq. 5, mean over a batch: (B,D), (B,D) -> (). The small number makes standing still 1, not NaN, and tells for motions of mm."""
+    """Eq. 5, mean over a batch: (B,D), (B,D) -> (). 1e-6 makes it 1 and not NaN for a motion of zero; it matters for millimetres only."""
     return (1 - (y * y_hat).sum(1) * torch.rsqrt((y.square().sum(1) + 1e-6) * (y_hat.square().sum(1) + 1e-6))).mean()
 
 
@@ -565,9 +570,9 @@ def checksum(model):
     return zlib.crc32(b"".join(tensor.cpu().numpy().tobytes() for tensor in model.values()))
 
 
-def load_weights(path: str | Path | None = None, device: str = "cpu") -> tuple[D3DLO, dict]:
+def load_weights(path: str | Path | None = None, device: str = "cpu", checkpoint: bool = False) -> tuple[D3DLO, dict]:
     """Weights file or run folder (None: those beside this file) -> (D3DLO in eval mode, the file's dict).
-    The network is rebuilt from the file itself. FileNotFoundError, ValueError."""
+    The network is rebuilt from the file itself. `checkpoint`: of a training, for going on with it. FileNotFoundError, ValueError."""
     path = Path(path or WEIGHTS)
     path = path / "weights.pt" if path.is_dir() else path
     if not path.is_file():
@@ -584,11 +589,15 @@ def load_weights(path: str | Path | None = None, device: str = "cpu") -> tuple[D
     except Exception as error:      # torch and pickle raise many kinds; to the user they are one
         reason = f"{type(error).__name__}: {error}".splitlines()[-1].strip()
         raise ValueError(f"{path}: no weights of D3DLO ({reason:.120}); give a weights.pt or a run folder") from None
+    if checkpoint != ("losses" in state):
+        raise ValueError(f"{path}: " + ("holds weights, but no training to go on with" if checkpoint else
+                                        "a checkpoint, which is not for use; give the weights.pt beside it"))
     return net.to(device).eval(), state
 
 
 def moved(clouds, T):
-    """(C,) records and T (C,4,4), rigid motions or mirrors -> the records of the clouds T x. No sampling and no ball changes."""
+    """(C,) records and T (C,4,4), rigid motions or mirrors -> the records with T applied to each cloud. Distances stay, and so sampling and
+    balls; the checksum does not."""
     out, T = clouds.copy(), T.astype(np.float32)
     for name in ("xyz", "group"):
         xyz = clouds[name][..., :3]
@@ -784,13 +793,13 @@ def parts_of(net, steps, device="cpu"):
     return parts
 
 
-def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=print, **remember):
+def fit(net, geometry, motions, run, seed=0, device="cpu", checkpoint=None, say=print, **remember):
     """Train `net` as its config says (section 4). Returns a net for use, in eval mode.
 
-    For that BatchNorm's statistics are recomputed: at the end, or before the last steps, of which config.frozen is the share. Then these train
-    the weights as they will be used, without the noise of a batch's statistics.
+    That needs BatchNorm statistics that fit the weights, so they are recomputed: at the end or, with config.frozen, before that last share of
+    the steps, which then train in eval mode: the network as it will be used, without the noise of a batch's statistics.
 
-    Every STORE_EVERY seconds and at the end writes RUN/checkpoint.pt, whose content `resume` goes on from, and RUN/weights.pt, the net for use,
+    Every STORE_EVERY seconds and at the end writes RUN/checkpoint.pt, whose content `checkpoint` goes on from, and RUN/weights.pt, the net for use,
     with `remember` in both. When interrupted finishes its step, writes the checkpoint and raises KeyboardInterrupt."""
     config, per_epoch, run = net.config, steps_per_epoch(motions, net.config), Path(run)
     total = config.epochs * per_epoch
@@ -798,10 +807,10 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
     parts = parts_of(net, total, device)
     _, objective, *minimizers = parts.values()              # the last are the optimisers and their schedules
     step, losses = 0, []
-    if resume:
-        step, losses = resume["step"], resume["losses"]
+    if checkpoint:
+        step, losses = checkpoint["step"], checkpoint["losses"]
         for name, part in parts.items():
-            part.load_state_dict(resume[name])
+            part.load_state_dict(checkpoint[name])
 
     def fixed_batches():        # drawn like those of the training, by random numbers of their own
         return batches(geometry, motions, config, (seed, 2 ** 31), 0, min(25, total), device)
@@ -852,7 +861,7 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", resume=None, say=prin
 
 # ------------------------------------------------------------------------------------------------------ section 5: evaluation
 
-PREDICTORS = "network", "standing still", "mean motion of training"        # the last two show what little is worth
+BASELINES = "standing still", "mean motion of training"
 
 
 def run_network(net, state, s, records, out, device="cpu", refine=0):
@@ -863,7 +872,7 @@ def run_network(net, state, s, records, out, device="cpu", refine=0):
               f"{strange[0]}", file=sys.stderr)
     motions, errors = predict_motions(net, records, device, refine=refine), {}
     constant = (np.broadcast_to(T, motions.shape) for T in (np.eye(4), from_vector(state["mean_motion"])))
-    for predictor, T in zip(PREDICTORS, (motions, *constant)):
+    for predictor, T in zip(("network", *BASELINES), (motions, *constant)):
         poses = accumulate(T)
         poses_cam = kitti.velo_to_camera(poses, s.Tr)
         if predictor == "network":
@@ -880,18 +889,19 @@ def report(errors, trained_on, out, source):
         some = [errors[name][predictor] for name in names if errors[name]]
         return metrics.summary([e for e, _ in some], [e for _, e in some]) | {"trained_on": any(trained_on[n] for n in names)}
 
-    parts = {split: [n for n in names if n in errors] for split, names in SPLITS.items()} | {"all": list(errors)}
     each = {name: summary([name]) for name in errors}
-    pooled = {part: {p: summary(names, p) for p in PREDICTORS} for part, names in parts.items() if names}
+    parts = {split: [n for n in names if n in errors] for split, names in SPLITS.items()} | {"all": list(errors)}
+    parts = {part: summary(names) | {p: summary(names, p) for p in BASELINES} for part, names in parts.items() if names}
     lengths = metrics.by_length([e["network"][0] for e in errors.values() if e])
-    results = {**source, "sequences": each, "pooled": pooled, "lengths": lengths}
+    splits = {split: parts[split] for split in SPLITS if split in parts}
+    results = {**source, "sequences": each, "splits": splits, "pooled": parts["all"], "lengths": lengths}
     plain = json.loads(json.dumps(results), parse_constant=lambda nan: None)    # JSON has no NaN
     with metrics.replacing(out / "results.json") as temporary:
         temporary.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
 
     rows = [metrics.row(name + " *" * s["trained_on"], s) for name, s in each.items()]
-    for part, predictions in pooled.items():
-        rows += [metrics.row(part + " *" * s["trained_on"] if p == "network" else f"  {p}", s) for p, s in predictions.items()]
+    for part, s in parts.items():
+        rows += [metrics.row(part + " *" * s["trained_on"], s), *(metrics.row(f"  {p}", s[p]) for p in BASELINES)]
     rows += [metrics.row(length, s) for length, s in lengths.items()]
     return (metrics.table(metrics.HEADER, rows) + "\n*: trained on. E_t, E_r: KITTI's segments of 100 to 800 m, rectified left camera "
             "frame. t step, r step: mean length and\nangle of inv(T_est) @ T_true of a step, Velodyne frame. -: no such segment, or no "
@@ -913,7 +923,7 @@ def data_root(data, names, whole=False):
 def choose(root, names=None):
     """Lists of `Sequence`: those to train on (names None: the training split, or without any of it all that is in no split), and those of the
     test and validation splits that are there beside them. ValueError when there is nothing to train on."""
-    there, held_out = [s.name for s in kitti.open_sequences(root)], SPLITS["test"] + SPLITS["validation"]
+    there, held_out = kitti.sequence_names(root), SPLITS["test"] + SPLITS["validation"]
     names = names or [n for n in SPLITS["train"] if n in there] or [n for n in there if n not in held_out]
     if not names:
         raise ValueError(f"{root}: holds only sequences of the test and validation splits, {' '.join(there)}; --sequences names those to train on")
@@ -923,17 +933,17 @@ def choose(root, names=None):
     return chosen, kitti.open_sequences(root, [n for n in held_out if n in there and n not in [s.name for s in chosen]])
 
 
-def remembered(digests, motions, geometry, before):
-    """What a file of weights holds of the data of its training, `before` being what the weights held that it began from."""
-    looks = np.concatenate([*(records["looks"] for records in geometry), np.reshape(before["seen"], (-1, len(LOOKS)))])
-    return {"train": digests, "before": sorted({*before["before"], *before["train"].values()}),
+def remembered(digests, motions, geometry, parent):
+    """What a file of weights holds of the data of its training, `parent` being what the weights held that it began from."""
+    looks = np.concatenate([*(records["looks"] for records in geometry), np.reshape(parent["seen"], (-1, len(LOOKS)))])
+    return {"train": digests, "before": sorted({*parent["before"], *parent["train"].values()}),
             "mean_motion": to_vector(np.concatenate(motions)).mean(0).tolist(), "seen": [looks.min(0).tolist(), looks.max(0).tolist()]}
 
 
 def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu", resume=False, weights=None):
     """The command `train`: train on `sequences` of `data` (None: the simulated city) as `config` says (None: the paper's, or the short
     recipe without data), evaluate on what there is of the test and validation splits beside them. With `weights` it begins from those,
-    whose network is kept; of `config` then count the fields that SHORT has. Returns the run folder. ValueError, FileNotFoundError."""
+    whose network is kept; only the fields named in SHORT are then taken from `config`. Returns the run folder. ValueError, FileNotFoundError."""
     check_device(device)
     run = Path(out or time.strftime("runs/%Y-%m-%d-%H%M%S"))
     if (run / "config.json").exists() and not resume:
@@ -942,22 +952,20 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     if resume:
         config, data, sequences, seed, weights = begun_with(run)
     data, weights = (path and str(Path(path).resolve()) for path in (data, weights))
-    checkpoint, before = run / "checkpoint.pt", {"train": {}, "before": [], "seen": []}
-    state = load_weights(checkpoint, device)[1] if resume and checkpoint.exists() else None
+    stored, parent = run / "checkpoint.pt", {"train": {}, "before": [], "seen": []}
+    state = load_weights(stored, device, checkpoint=True)[1] if resume and stored.exists() else None
     if state:
-        before = state | {"train": {}}
+        parent = state | {"train": {}}
     elif weights:
-        first, before = load_weights(weights)
+        first, parent = load_weights(weights)
         config = replace(first.config, **{name: getattr(config, name) for name in SHORT})
     root = data_root(data, sequences, whole=True)
     chosen, held_out = choose(root, sequences)
     names, motions, digests = [s.name for s in chosen], [s.motions() for s in chosen], {s.name: fingerprint(s) for s in chosen}
-    if state and "losses" not in state:
-        raise ValueError(f"{checkpoint}: holds weights, but no training to go on with")
     if state and state["train"] != digests:
-        raise ValueError(f"{checkpoint}: was trained on other data than lies there now; resume with the data it was begun with")
+        raise ValueError(f"{stored}: was trained on other data than lies there now; resume with the data it was begun with")
     geometry = load_geometry(chosen + held_out, config)[:len(chosen)]           # of all, so that a scan held out that is broken is met now
-    remember = remembered(digests, motions, geometry, before)
+    remember = remembered(digests, motions, geometry, parent)
     note_beginning(run, dict(data=data, sequences=names, seed=seed, device=device, weights=weights), config, digests)
 
     def say(line):
@@ -970,7 +978,7 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     if weights and not state:
         net.load_state_dict(first.state_dict())
     say(f"{sum(p.numel() for p in net.parameters()):,} parameters, {sum(map(len, motions)):,} pairs of scans of {' '.join(names)}, "
-        f"{config.epochs} epochs of {steps_per_epoch(motions, config)} batches -> {run}\nloss: eq. 2, metres and degrees alike")
+        f"{config.epochs} epochs of {steps_per_epoch(motions, config)} batches -> {run}")
     if not sequences and (gone := set(SPLITS["train"]) - set(names)):
         say(f"of the training split {' '.join(sorted(gone))} are not there")
     fit(net, geometry, motions, run, seed, device, state, say, **remember)
@@ -1016,7 +1024,7 @@ def check_device(device):
     try:
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError, NotImplementedError):
-        raise ValueError(f"--device {device}: this PyTorch has none; cpu, or on a machine with one cuda or mps") from None
+        raise ValueError(f"--device {device}: not available here; use cpu, or cuda or mps where PyTorch has them") from None
 
 
 def keep_freed_memory():
@@ -1052,7 +1060,7 @@ def begun_with(run):
 
 
 def number(text):
-    """For argparse."""
+    """A whole number, 0 or more, for argparse."""
     if int(text) < 0:
         raise argparse.ArgumentTypeError("must be 0 or more")
     return int(text)
@@ -1078,11 +1086,11 @@ def command_line(argv):
         add("--sequences", nargs="+", metavar="NN", help="names, or splits: train, test, validation, all")
 
     add = t.add_argument_group("network").add_argument
-    add("--weights", metavar="FILE|RUN", help="begin from these weights, with their network, and not from random ones")
+    add("--weights", metavar="FILE|RUN", help="start from these weights and their network, not from random ones")
     add("--neighbors", type=int, metavar="N", help=f"n_n of the first set abstraction, Table 2 (default: {Config.sa1.n_n})")
     add("--no-plane", action="store_false", dest="plane", help="leave out the points of the ground plane, Table 2")
     add = t.add_argument_group("training").add_argument
-    add("--short", action="store_true", help="fewer epochs, one-cycle learning rate, Muon, augmentation (always without --data)")
+    add("--short", action="store_true", help="our short recipe: few epochs, one-cycle rate, Muon, augmentation, BatchNorm fixed at the end (implied without --data)")
     add("--epochs", type=int, metavar="N", help=f"default: {Config.epochs}, short {SHORT['epochs']}")
     add("--batch", type=int, metavar="N", help=f"pairs in a batch, each both ways (default: {Config.batch}, short {SHORT['batch']})")
     add("--lr", type=float, metavar="X", help=f"learning rate, at its highest (default: {Config.lr}, short {SHORT['lr']})")
@@ -1100,10 +1108,7 @@ def command_line(argv):
     add = e.add_argument_group("results").add_argument
     add("--out", metavar="DIR", help="folder for NN.txt and results.json (default: results/TIME)")
     add("--plot", action="store_true", help="draw the paths and the errors by length; needs matplotlib")
-    args, strange = parser.parse_known_args(argv)
-    if strange:
-        commands.choices[args.command].error(f"unrecognized arguments: {' '.join(strange)}")         # with the command's usage
-    return vars(args)
+    return vars(parser.parse_args(argv))
 
 
 def config_from(args):

@@ -41,7 +41,7 @@ def read_calib(path: str | Path) -> np.ndarray:
     """calib.txt of a sequence -> T_cam0_velo (4,4) float64, its row `Tr`: Velodyne points to the rectified left camera [m].
     Raises FileNotFoundError; ValueError when `Tr` is missing, is not 12 finite numbers or does not hold a rotation."""
     path = Path(path)
-    get = "KITTI's is in data_odometry_calib.zip; for scans and poses of your own in one frame write the line Tr: 1 0 0 0 0 1 0 0 0 0 1 0"
+    get = "KITTI's is in data_odometry_calib.zip; for drives of your own write the line Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0"
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: {get}.")
     rows = re.findall(rb"^\s*Tr\s*:(.*)$", path.read_bytes(), re.M)
@@ -145,21 +145,27 @@ class Sequence:
         return invert(self.poses[:-1]) @ self.poses[1:]
 
 
-def open_sequences(root: str | Path, names: str | list[str] | None = None) -> list[Sequence]:
-    """ROOT and names -> list of `Sequence`, in the order given, each once. A name is a folder under ROOT/sequences, a split of SPLITS (as
-    much of it as there is) or 'all'; None is 'all'. Raises FileNotFoundError when ROOT is not in KITTI's odometry layout, ValueError for an
-    unknown name or a split of which nothing is there, and whatever `Sequence` raises."""
+def sequence_names(root: str | Path) -> list[str]:
+    """The sequences of ROOT that have scans. Raises FileNotFoundError when there are none, as where ROOT is not in KITTI's odometry layout."""
     root = Path(root)
-    there = sorted(p.name for p in (root / "sequences").glob("*") if p.is_dir() and not p.name.startswith("."))
+    there = sorted(p.parent.name for p in root.glob("sequences/[!.]*/velodyne") if next(p.glob("*.bin"), None))
     if not there:
         raw = any(re.search(r"_drive_\d+|^velodyne_points$", p.name) for p in (root, *root.glob("*"), *root.glob("*/*")))
         raise FileNotFoundError(f"{root} has no sequences{', it is in the layout of KITTI raw data' if raw else ''}: expected "
                                 "ROOT/sequences/00/{velodyne/000000.bin, calib.txt} and ROOT/poses/00.txt, as KITTI's archives unpack.")
+    return there
+
+
+def open_sequences(root: str | Path, names: str | list[str] | None = None) -> list[Sequence]:
+    """ROOT and names -> list of `Sequence`, in the order given, each once. A name is a folder under ROOT/sequences, a split of SPLITS (as
+    much of it as there is) or 'all'; None is 'all'. Raises ValueError for an unknown name or a split of which nothing is there, and whatever
+    `sequence_names` and `Sequence` raise."""
+    there = sequence_names(root)
     choices = {split: [n for n in part if n in there] for split, part in SPLITS.items()} | {"all": there} | {n: [n] for n in there}
     names = ["all"] if names is None else [names] if isinstance(names, str) else list(names)
     for name in names:
         if not choices.get(name):
-            raise ValueError(f"{root} has no sequence or split {name!r}: there are {' '.join(n for n in choices if choices[n])}.")
+            raise ValueError(f"{root} has no sequence or split {name!r} with scans: there are {' '.join(n for n in choices if choices[n])}.")
     return [Sequence(root, n) for n in dict.fromkeys(n for name in names for n in choices[name])]
 
 
@@ -206,7 +212,7 @@ def remove_plane(scan: np.ndarray, threshold=0.15, max_tilt=15.0, hypotheses=400
 # The world is vertical prisms on a ground, one row each: yawed boxes and upright cylinders. It is flat, and hills bend it afterwards.
 # In m and radians; FUZZ is the depth [m] to which foliage lets light in, ROUND is 1 for a cylinder.
 X, Y, YAW, HALF_X, HALF_Y, Z0, Z1, ALBEDO, FUZZ, ROUND = range(10)
-CITY = 3  # raise when the city changes, so that scans of two versions are never mixed
+CITY = 3  # one more when the city changes, so that scans of two versions are never mixed
 ELEVATION = np.radians(np.r_[np.linspace(-24.33, -8.83, 32), np.linspace(-8.33, 2.0, 32)])  # the HDL-64E's 64 beams, bottom to top
 SENSOR_HEIGHT, MIN_RANGE, CITY_RANGE = 1.73, 2.5, 80.0  # m
 LANE = 3.5  # m; we keep to the right lane of two, so the road reaches from 1.75 m right to 5.25 m left of our path
@@ -655,7 +661,7 @@ def _missing(root, names, seed, scans, azimuth):
 def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range(11)), scans=None, azimuth=1800, workers=None) -> Path:
     """Drives an HDL-64E through one simulated city per sequence and writes ROOT in KITTI's odometry layout with exact ground truth -> ROOT.
 
-    sequences: names, splits or 'all'; scans: number per sequence (None: 320 for the training split, else 170; tests drive more than 115 m);
+    sequences: names, splits or 'all'; scans: number per sequence (None: 170 for test and validation, which drive more than 115 m, else 320);
     azimuth: rays per beam and turn; workers: processes (None: one per core). The same arguments give the same bytes, whatever else is made
     along. A sequence appears when it is complete; one that is there already, made with the same settings, is left as it is.
     Raises ValueError for arguments out of range, or when ROOT holds such a sequence from elsewhere or of other settings."""
@@ -674,6 +680,7 @@ def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range
     pool = ProcessPoolExecutor(workers, initializer=worker_starts) if workers > 1 and len(tasks) > 8 else None
     try:
         for folder in temporary.values():
+            shutil.rmtree(folder, ignore_errors=True)  # of an earlier process of the same number
             (folder / "velodyne").mkdir(parents=True)
         saved = pool.map(_save_scan, *zip(*tasks), chunksize=8) if pool else (_save_scan(*task) for task in tasks)
         saved = progress(saved, len(tasks), "simulating")
@@ -709,7 +716,7 @@ def main(argv=None):
     parser.add_argument("dir", metavar="DIR", help="where to")
     parser.add_argument("--seed", type=int, metavar="N", default=0, help="another seed, other cities (default: 0)")
     parser.add_argument("--sequences", nargs="+", metavar="NN", default=["all"], help="names, or train, test, validation, all (default)")
-    parser.add_argument("--scans", type=int, metavar="N", help="scans per sequence (default: 320 for training sequences, else 170)")
+    parser.add_argument("--scans", type=int, metavar="N", help="scans per sequence (default: 170 for test and validation, else 320)")
     parser.add_argument("--azimuth", type=int, metavar="N", default=1800, help="rays per beam and turn (default: 1800)")
     args = parser.parse_args(argv)
     terminate_as_interrupted()

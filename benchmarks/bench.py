@@ -1,4 +1,4 @@
-"""How fast it is, each piece of work against a baseline in the same run: ratios of medians, with their spread.
+"""How fast it is, each piece of work against a baseline in the same run: medians over rounds of the ratio, and its range.
 
     python benchmarks/bench.py                          # on a few simulated scans
     python benchmarks/bench.py --data ROOT              # on scans in KITTI odometry layout

@@ -124,7 +124,7 @@ def child(run, config, root, sequences, evaluated, seed):
 def figures(run, split):
     """E_t, E_r, t step, r step of a run on a split."""
     results = json.loads((run / "all" / "results.json").read_text())
-    result = results["pooled"][split]["network"]
+    result = (results["splits"] | {"all": results["pooled"]})[split]
     return [result[key] if result[key] is not None else math.nan for key in ("E_t", "E_r", "t_step_m", "r_step_deg")]
 
 

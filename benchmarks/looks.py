@@ -1,6 +1,6 @@
 """What the network sees of scans: to compare a simulation, or another sensor, with the real drives.
 
-    python benchmarks/looks.py ROOT [NN ...]        # folders in KITTI odometry layout
+    python benchmarks/looks.py ROOT [NN ...]        # folders in KITTI odometry layout, with poses
     python benchmarks/looks.py data/full 00 01 02 08 09
 
 For each sequence, over 8 scans spread evenly: usable points, mean intensity, share of points in the fullest 0.3 m of height (the ground),

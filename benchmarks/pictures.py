@@ -3,16 +3,14 @@
     python benchmarks/pictures.py method docs/method.png            # what the network sees of two simulated scans
     python benchmarks/pictures.py method docs/method.png --data ROOT --sequence 00 --scan 100
     python benchmarks/pictures.py curve runs/A/curve.png runs/A runs/B ...      # loss by epoch
-    python benchmarks/pictures.py budget docs/budget.png runs/A runs/B ...      # errors of finished trainings by their pair-steps
+    python d3dlo.py eval --data data/full --sequences 04 05 06 --refine 2 --plot    # docs/trajectory.png is its plot.png
 """
 import argparse
-import json
 import re
 import sys
 from pathlib import Path
 
 import numpy as np
-import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import d3dlo
@@ -71,22 +69,6 @@ def curve(runs):
     return figure
 
 
-def budget(runs):
-    """Errors of the trainings in `runs`, as their own evaluation found them, by pair-steps."""
-    points = []
-    for run in runs:
-        state = torch.load(run / "weights.pt", weights_only=True)
-        config, results = d3dlo.Config(**state["config"]), json.loads((run / "results" / "results.json").read_text())["pooled"]["test"]["network"]
-        points.append((state["step"] * config.batch * (2 if config.swap == "both" else 1), results["E_t"], results["t_step_m"], results["r_step_deg"]))
-    steps, *errors = np.array(sorted(points)).T
-    figure = metrics.picture(10, 3)
-    for axis, error, label in zip(figure.subplots(1, 3), errors, ("E_t [%]", "error of a step [m]", "error of a step [deg]")):
-        axis.loglog(steps, error, "ko-")
-        axis.set(xlabel="pair-steps of the whole training", ylabel=label)
-        axis.grid(color="0.9", which="both")
-    return figure
-
-
 def main():
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -96,15 +78,14 @@ def main():
     m.add_argument("--data", metavar="ROOT", help="folder in KITTI odometry layout (default: the simulated city)")
     m.add_argument("--sequence", default="03", metavar="NN")
     m.add_argument("--scan", type=int, default=60, metavar="N")
-    for name in ("curve", "budget"):
-        p = commands.add_parser(name)
-        p.add_argument("picture", type=Path)
-        p.add_argument("runs", nargs="+", type=Path, metavar="RUN")
+    c = commands.add_parser("curve")
+    c.add_argument("picture", type=Path)
+    c.add_argument("runs", nargs="+", type=Path, metavar="RUN")
     args = parser.parse_args()
     if args.command == "method":
         figure = method(args.data or kitti.simulate(d3dlo.SIMULATED, sequences=[args.sequence]), args.sequence, args.scan)
     else:
-        figure = {"curve": curve, "budget": budget}[args.command](args.runs)
+        figure = curve(args.runs)
     with metrics.replacing(args.picture) as temporary:
         figure.savefig(temporary, format="png", dpi=100)
     print(args.picture)

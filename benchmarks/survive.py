@@ -83,7 +83,7 @@ def interrupt(run, rng):
 def whole(run):
     """Everything in a run's folder can be read."""
     for path in run.glob("*.pt"):
-        d3dlo.load_weights(path)
+        d3dlo.load_weights(path, checkpoint=path.name == "checkpoint.pt")
     if (run / "config.json").exists():
         d3dlo.begun_with(run)
 
