@@ -14,7 +14,8 @@ B pairs of scans, C clouds (scans) in a batch, D features.
     python d3dlo.py train --data ROOT           # KITTI odometry, the paper's schedule
     python d3dlo.py eval --data ROOT            # with the weights beside this file
 """
-import argparse, copy, ctypes, hashlib, itertools, json, math, platform, shutil, signal, subprocess, sys, threading, time, warnings, zipfile, zlib
+import argparse, copy, ctypes, hashlib, itertools, json, math, platform, shutil, signal, subprocess
+import sys, threading, time, warnings, zipfile, zlib
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -45,7 +46,7 @@ class Layer(NamedTuple):
     r: float | None         # radius of the ball [m]
     n_fps: int | None       # centroids kept by farthest point sampling
     n_n: int | None         # neighbours of a centroid
-    mlp: tuple              # output width of every linear layer: sa1's [4, 8, 16, 32] are four, 4 inputs -> 4 -> 8 -> 16 -> 32, else not 61,290
+    mlp: tuple              # output width of every linear layer: sa1's [4, 8, 16, 32] are four layers after 4 inputs, else not 61,290
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class Config:
     mlp: Layer = Layer(None, None, None, (64, 6))
 
     spread: int = 1             # ours: which n_n points of a ball: the nearest; with 2 about every second of the nearest 2 n_n, and so on
-    max_range: float = 50.0     # m; ours: what is further is left out. Spread over 80 m, 1,024 centroids lie too far apart for Table 1's balls
+    max_range: float = 50.0     # m; ours: what is further is left out. Over 80 m, 1,024 centroids lie too far apart for Table 1's balls
     plane: bool = True          # keep the points of the ground plane, Table 2's "pp"
     epochs: int = 500           # section 4
     batch: int = 16             # pairs; ours
@@ -107,7 +108,7 @@ class Config:
         return json.loads(json.dumps(asdict(self)))
 
 
-SHORT = dict(epochs=9, batch=8, optimizer="muon", lr=1e-2, schedule="one-cycle", augment=True, frozen=0.25)     # in 10 minutes on the simulated city
+SHORT = dict(epochs=9, batch=8, optimizer="muon", lr=1e-2, schedule="one-cycle", augment=True, frozen=0.25)      # 10 minutes on the city
 
 
 # ------------------------------------------------------------------------------------ sections 3.1, 3.2: problem and objective
@@ -799,8 +800,8 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", checkpoint=None, say=
     That needs BatchNorm statistics that fit the weights, so they are recomputed: at the end or, with config.frozen, before that last share of
     the steps, which then train in eval mode: the network as it will be used, without the noise of a batch's statistics.
 
-    Every STORE_EVERY seconds and at the end writes RUN/checkpoint.pt, whose content `checkpoint` goes on from, and RUN/weights.pt, the net for use,
-    with `remember` in both. When interrupted finishes its step, writes the checkpoint and raises KeyboardInterrupt."""
+    Every STORE_EVERY seconds and at the end writes RUN/checkpoint.pt, whose content `checkpoint` goes on from, and RUN/weights.pt, the net for
+    use, with `remember` in both. When interrupted finishes its step, writes the checkpoint and raises KeyboardInterrupt."""
     config, per_epoch, run = net.config, steps_per_epoch(motions, net.config), Path(run)
     total = config.epochs * per_epoch
     frozen_from = round(total * (1 - config.frozen))
@@ -926,7 +927,7 @@ def choose(root, names=None):
     there, held_out = kitti.sequence_names(root), SPLITS["test"] + SPLITS["validation"]
     names = names or [n for n in SPLITS["train"] if n in there] or [n for n in there if n not in held_out]
     if not names:
-        raise ValueError(f"{root}: holds only sequences of the test and validation splits, {' '.join(there)}; --sequences names those to train on")
+        raise ValueError(f"{root}: holds only test and validation sequences, {' '.join(there)}; --sequences names those to train on")
     chosen = kitti.open_sequences(root, names)
     if not sum(len(s) - 1 for s in chosen):
         raise ValueError(f"{root}: sequence {' '.join(s.name for s in chosen)} has a single scan; training needs pairs")
@@ -943,7 +944,7 @@ def remembered(digests, motions, geometry, parent):
 def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu", resume=False, weights=None):
     """The command `train`: train on `sequences` of `data` (None: the simulated city) as `config` says (None: the paper's, or the short
     recipe without data), evaluate on what there is of the test and validation splits beside them. With `weights` it begins from those,
-    whose network is kept; only the fields named in SHORT are then taken from `config`. Returns the run folder. ValueError, FileNotFoundError."""
+    whose network is kept; only the fields named in SHORT are then taken from `config`. Returns the run folder. ValueError, OSError."""
     check_device(device)
     run = Path(out or time.strftime("runs/%Y-%m-%d-%H%M%S"))
     if (run / "config.json").exists() and not resume:
@@ -1090,7 +1091,8 @@ def command_line(argv):
     add("--neighbors", type=int, metavar="N", help=f"n_n of the first set abstraction, Table 2 (default: {Config.sa1.n_n})")
     add("--no-plane", action="store_false", dest="plane", help="leave out the points of the ground plane, Table 2")
     add = t.add_argument_group("training").add_argument
-    add("--short", action="store_true", help="our short recipe: few epochs, one-cycle rate, Muon, augmentation, BatchNorm fixed at the end (implied without --data)")
+    add("--short", action="store_true", help=(
+        "our short recipe: few epochs, one-cycle rate, Muon, augmentation, BatchNorm fixed at the end (implied without --data)"))
     add("--epochs", type=int, metavar="N", help=f"default: {Config.epochs}, short {SHORT['epochs']}")
     add("--batch", type=int, metavar="N", help=f"pairs in a batch, each both ways (default: {Config.batch}, short {SHORT['batch']})")
     add("--lr", type=float, metavar="X", help=f"learning rate, at its highest (default: {Config.lr}, short {SHORT['lr']})")
