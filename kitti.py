@@ -208,6 +208,48 @@ def remove_plane(scan: np.ndarray, threshold=0.15, max_tilt=15.0, hypotheses=400
     return scan if abs(n[2]) < np.cos(np.radians(max_tilt)) else scan[~near(n, d)]  # a wall alone is no ground
 
 
+# ----------------------------------------------------------------------------------------------------------- long work
+
+def progress(items, total, what):
+    """Yields the items while saying on stderr how many of `total` are done, how fast, and how long the rest will take. On a terminal the
+    line is rewritten in place; elsewhere a plain line comes every 10 s, or every tenth of the time so far when that is longer."""
+    tty, began, done = sys.stderr.isatty(), time.monotonic(), 0
+    due = began + (0.2 if tty else 10)  # s, when to say something again
+
+    def say(end):
+        rate = done / max(time.monotonic() - began, 1e-9)
+        minutes, seconds = divmod(round((total - done) / rate), 60)
+        line = f"{what}: {done}/{total}, {rate:.3g} /s, {minutes}:{seconds:02d} left"
+        print(f"\r{line:<79}" if tty else line, end=end, file=sys.stderr, flush=True)
+    try:
+        for done, item in enumerate(items):
+            if done and time.monotonic() > due:
+                say("" if tty else "\n")
+                due = time.monotonic() + (0.2 if tty else max(10, (time.monotonic() - began) / 10))
+            yield item
+            done += 1
+    finally:
+        if done:
+            say("\n")
+
+
+def cores():
+    """Cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def worker_starts():
+    """For the processes of a pool."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which stops its workers
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def terminate_as_interrupted():
+    """From here on SIGTERM is as Ctrl-C, which leaves through every `finally`."""
+    if threading.current_thread() is threading.main_thread():  # Python's rule for signals
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+
 # ---------------------------------------------------------------------------------------------------- the simulated city
 # The world is vertical prisms on a ground, one row each: yawed boxes and upright cylinders. It is flat, and hills bend it afterwards.
 # In m and radians; FUZZ is the depth [m] to which foliage lets light in, ROUND is 1 for a cylinder.
@@ -582,46 +624,6 @@ def _simulate_scan(name, seed, scans, azimuth, i):
     # R^T turns them into the sensor's; no BLAS, whose sums depend on its threads
     x, y, z = (x * q[0] + y * q[1] + z * q[2] for q in R.T.astype(f4))
     return np.stack([x, y, z, np.round(np.clip(light, 0, 0.99), 2)], axis=1)  # (N,4)
-
-
-def progress(items, total, what):
-    """Yields the items while saying on stderr how many of `total` are done, how fast, and how long the rest will take. On a terminal the
-    line is rewritten in place; elsewhere a plain line comes every 10 s, or every tenth of the time so far when that is longer."""
-    tty, began, done = sys.stderr.isatty(), time.monotonic(), 0
-    due = began + (0.2 if tty else 10)  # s, when to say something again
-
-    def say(end):
-        rate = done / max(time.monotonic() - began, 1e-9)
-        minutes, seconds = divmod(round((total - done) / rate), 60)
-        line = f"{what}: {done}/{total}, {rate:.3g} /s, {minutes}:{seconds:02d} left"
-        print(f"\r{line:<79}" if tty else line, end=end, file=sys.stderr, flush=True)
-    try:
-        for done, item in enumerate(items):
-            if done and time.monotonic() > due:
-                say("" if tty else "\n")
-                due = time.monotonic() + (0.2 if tty else max(10, (time.monotonic() - began) / 10))
-            yield item
-            done += 1
-    finally:
-        if done:
-            say("\n")
-
-
-def cores():
-    """Cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def worker_starts():
-    """For the processes of a pool."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which stops its workers
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-
-
-def terminate_as_interrupted():
-    """From here on SIGTERM is as Ctrl-C, which leaves through every `finally`."""
-    if threading.current_thread() is threading.main_thread():  # Python's rule for signals
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def _save_scan(path, name, settings, i):
