@@ -3,7 +3,7 @@
     python benchmarks/pictures.py method docs/method.png            # what the network sees of two simulated scans
     python benchmarks/pictures.py method docs/method.png --data ROOT --sequence 00 --scan 100
     python benchmarks/pictures.py curve runs/A/curve.png runs/A runs/B ...      # loss by epoch
-    python d3dlo.py eval --data data/full --sequences 04 05 06 --refine 2 --plot    # docs/trajectory.png is its plot.png
+    python d3dlo.py eval --data data/full --sequences 04 05 06 --refine 2 --plot    # its plot.png is docs/trajectory.png
 """
 import argparse
 import re
