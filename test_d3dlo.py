@@ -681,6 +681,16 @@ def test_weights_rebuild_their_network_from_the_file_itself(tmp_path, config):
         assert_array_equal(predict(loaded, p, q), predict(net, p, q))
 
 
+@pytest.mark.parametrize("name, parameters", [("d3dlo.pt", 61290), ("d3dlo-coordinates.pt", 61482)])
+def test_the_weights_shipped_follow_a_drive_they_have_not_seen(tmp_path, name, parameters):
+    s, = kitti.open_sequences(kitti.simulate(tmp_path, seed=1, sequences=["06"], scans=8, workers=1))
+    net, _ = load_weights(HERE / name)
+    poses = d3dlo.accumulate(d3dlo.predict_motions(net, np.stack([scan_geometry(s.scan(i)) for i in range(8)]), refine=1))
+    moved = np.linalg.norm(s.motions()[:, :3, 3], axis=1)
+    t, r = metrics.step_errors(s.poses, poses).mean(0)
+    assert sum(p.numel() for p in net.parameters()) == parameters and moved.mean() > 0.5 and t < 0.15 and r < 0.2
+
+
 @given(SEED)
 def test_odometry_multiplies_relative_poses_and_a_refused_scan_changes_nothing(tmp_path, seed):
     rng, w = generator(seed), tmp_path / "w.pt"
