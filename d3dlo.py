@@ -281,10 +281,11 @@ def fingerprint(sequence):
 
 
 def _geometry_of_file(path, config):
+    scan = kitti.read_scan(path)
     try:
-        return scan_geometry(kitti.read_scan(path), config)
+        return scan_geometry(scan, config)
     except ValueError as error:
-        raise ValueError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
+        raise ValueError(f"{path}: {error}") from None
 
 
 def _cached(file, dtype, n):
@@ -794,6 +795,17 @@ def parts_of(net, steps, device="cpu"):
     return parts
 
 
+def training_step(objective, net, batch, target, minimizers):
+    """One step of `minimizers`, the optimisers and their schedules, in the mode the network is in. Returns the loss before it."""
+    loss = objective(net(batch), target)
+    net.zero_grad()
+    objective.zero_grad()
+    loss.backward()
+    for minimizer in minimizers:
+        minimizer.step()
+    return loss.item()
+
+
 def fit(net, geometry, motions, run, seed=0, device="cpu", checkpoint=None, say=print, **remember):
     """Train `net` as its config says (section 4). Returns a net for use, in eval mode.
 
@@ -827,20 +839,14 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", checkpoint=None, say=
         save(run / "weights.pt", config=config.as_dict(), step=step, **remember, model=usable.state_dict())
         return usable.eval()
 
-    stored = time.monotonic()
-    todo = batches(geometry, motions, config, (seed,), step, total, device)
+    stored, todo = time.monotonic(), batches(geometry, motions, config, (seed,), step, total, device)
     with interruption_waits() as came:
         for batch, target in progress(todo, total - step, f"training, batches of {config.batch} pairs, swap: {config.swap}"):
             if step == frozen_from:
                 recompute_statistics(net, fixed_batches())
-            loss, rate = objective(net.train(step < frozen_from)(batch), target), minimizers[0].param_groups[0]["lr"]
-            net.zero_grad()
-            objective.zero_grad()
-            loss.backward()
-            for minimizer in minimizers:
-                minimizer.step()
+            rate = minimizers[0].param_groups[0]["lr"]
+            losses.append(training_step(objective, net.train(step < frozen_from), batch, target, minimizers))
             step += 1
-            losses.append(loss.item())
             if step % per_epoch == 0:
                 say(f"epoch {step // per_epoch}/{config.epochs}: loss {np.mean(losses):.4f}, learning rate {rate:.1e}")
                 losses = []
