@@ -82,12 +82,15 @@ def main():
     c.add_argument("picture", type=Path)
     c.add_argument("runs", nargs="+", type=Path, metavar="RUN")
     args = parser.parse_args()
-    if args.command == "method":
-        figure = method(args.data or kitti.simulate(d3dlo.SIMULATED, sequences=[args.sequence]), args.sequence, args.scan)
-    else:
-        figure = curve(args.runs)
-    with metrics.replacing(args.picture) as temporary:
-        figure.savefig(temporary, format="png", dpi=100)
+    try:
+        if args.command == "method":
+            figure = method(args.data or kitti.simulate(d3dlo.SIMULATED, sequences=[args.sequence]), args.sequence, args.scan)
+        else:
+            figure = curve(args.runs)
+        with metrics.replacing(args.picture) as temporary:
+            figure.savefig(temporary, format="png", dpi=100)
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
     print(args.picture)
 
 
