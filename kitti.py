@@ -7,15 +7,16 @@ in the Velodyne frame, because that is what the points are in: T_velo = inv(Tr) 
     python kitti.py simulate data/city      # an HDL-64E drives through 11 little cities, with exact ground truth: 2,620 scans, 4.2 GB
     python kitti.py simulate data/tiny --sequences 00 07 --scans 40 --azimuth 900
 """
-import argparse, functools, json, os, re, shutil, signal, sys, threading, time, warnings, zlib
+import argparse, functools, hashlib, json, os, re, shutil, signal, sys, threading, time, warnings, zlib
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from metrics import read_poses, temporary_beside, write_poses
+from metrics import read_poses, replacing, temporary_beside, write_poses
 
 SPLITS = {"train": ("00", "01", "02", "08", "09"), "test": ("03", "04", "05", "06", "10"), "validation": ("07",)}  # paper, section 4
 
@@ -169,7 +170,43 @@ def open_sequences(root: str | Path, names: str | list[str] | None = None) -> li
     return [Sequence(root, n) for n in dict.fromkeys(n for name in names for n in choices[name])]
 
 
-# ------------------------------------------------------------------------------------------------------------ the plane
+# ------------------------------------------------------------------------------------------------ from a scan to a cloud
+
+BROKEN_RANGE, BROKEN_INTENSITY = 1000.0, 65536  # m; no LiDAR returns more, so such points are broken
+# Scan statistics, used to warn about domain shift.
+STATS = "usable points", "mean intensity", "median range of the centroids [m]", "share of points in the fullest 0.3 m of height, the ground"
+
+
+def usable_points(scan, max_range=None, plane=True):
+    """The points of a scan that the network is given: (N,4) -> (M,4) float32, and how many broken points were dropped.
+
+    Broken points (not finite, or of a range or intensity that no LiDAR returns) go first, then points beyond `max_range` metres
+    (None: none of them), then, unless `plane`, the ground. The order stays. ValueError for another shape than (N,4)."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        scan = np.asarray(scan, np.float32)
+        if scan.ndim != 2 or scan.shape[1] != 4:
+            raise ValueError(f"a scan has the shape (N, 4): x, y, z [m] and intensity, not {scan.shape}")
+        x, y, z, intensity = scan.T
+        squared = x * x + y * y + z * z
+        sound = (squared < BROKEN_RANGE ** 2) & (np.abs(intensity) < BROKEN_INTENSITY)  # NaN compares false
+        near = squared < (max_range or BROKEN_RANGE) ** 2
+    kept = scan[sound & near]
+    return kept if plane else remove_plane(kept), np.count_nonzero(~sound)
+
+
+def scan_stats(scan, centroids):
+    """The usable points of a scan (M,4) and the centroids sampled from them (S,3) -> (4,) STATS."""
+    layer = np.floor(np.clip(scan[:, 2], -100, 100) / 0.3).astype(int)
+    ground = np.bincount(layer - layer.min()).max() / len(scan)
+    return np.array([len(scan), scan[:, 3].mean(dtype=float), np.median(np.linalg.norm(centroids, axis=1)), ground])
+
+
+def domain_shift(stats, seen):
+    """Which STATS (4,) lie outside the range seen in training (2,4), by more than a factor of 1.5 -> a text, empty if none."""
+    return "; ".join(f"{name} {x:.3g} (in training {low:.3g} to {high:.3g})" for name, x, low, high in zip(STATS, stats, *seen)
+                     if not low / 1.5 <= x <= high * 1.5)
+
+
 
 def remove_plane(scan: np.ndarray, threshold=0.15, max_tilt=15.0, hypotheses=400, subsample=4000, seed=0) -> np.ndarray:
     """A scan (N,3+) -> the scan without the points nearer than `threshold` [m] to its dominant near-horizontal plane (RANSAC; paper 4).
@@ -248,6 +285,101 @@ def terminate_as_interrupted():
     """From here on SIGTERM is as Ctrl-C, which leaves through every `finally`."""
     if threading.current_thread() is threading.main_thread():  # Python's rule for signals
         signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+
+@contextmanager
+def delayed_interrupt():
+    """Ctrl-C and SIGTERM wait for the work under way: yields a list that holds the signal once one came.
+
+    A second signal interrupts at once. Outside the main thread signals are left alone (Python's rule)."""
+    received, before = [], {}
+
+    def note(number, frame):
+        if received:
+            raise KeyboardInterrupt
+        received.append(number)
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            before[number] = signal.signal(number, note)
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+
+# ---------------------------------------------------------------------------------------------------------------- cache
+
+def cached_records(sequences, compute, dtype, settings, cache="cache"):
+    """Compute a record for every scan, once: later calls read the records from files.
+
+    sequences: list of `Sequence`; compute: a function scan (N,4) -> record of `dtype` that can be pickled; settings:
+    whatever else the records depend on. Returns two lists with an entry for each sequence: records (n,), memory-mapped, and
+    the CRC-32 of every scan (n,) uint32, by which `fingerprint` identifies the data.
+
+    The name of a file is a hash of the settings and of the path, size and times of every scan, so a stale file is never read.
+    Files are moved into place when complete, so two processes may share a cache. A damaged file is made again. Scans are
+    shared out over the cores. ValueError, naming the file, for a scan that `compute` refuses."""
+    stored = np.dtype([("record", dtype), ("scan_crc", "u4"), ("crc", "u4")])
+    files = [Path(cache) / f"{s.name}-{_cache_key(s, settings, dtype)}.npy" for s in sequences]
+    missing = [(s, file) for s, file in zip(sequences, files) if not _is_intact(file, stored, len(s))]
+    if missing:
+        paths = [path for s, _ in missing for path in s.scan_paths]
+        pool = ProcessPoolExecutor(cores(), initializer=worker_starts)
+        try:
+            rows = pool.map(functools.partial(_cache_row, compute=compute, dtype=stored), paths, chunksize=4)
+            rows = progress(rows, len(paths), "sampling and grouping, scans")
+            for s, file in missing:
+                header = {"descr": np.lib.format.dtype_to_descr(stored), "fortran_order": False, "shape": (len(s),)}
+                with replacing(file) as temporary, open(temporary, "wb") as out:  # a memory map would crash on a full disk
+                    np.lib.format.write_array_header_1_0(out, header)
+                    for _ in range(len(s)):
+                        out.write(next(rows))
+            next(rows, None)  # lets the progress line end
+        finally:
+            pool.shutdown(cancel_futures=True)
+    loaded = [np.load(file, mmap_mode="r") for file in files]
+    return [rows["record"] for rows in loaded], [np.array(rows["scan_crc"]) for rows in loaded]
+
+
+def _cache_key(sequence, settings, dtype):
+    """Hash of all that a cache file depends on. The change time (ctime) notices what keeps size and modification time."""
+    stats = [os.stat(path) for path in sequence.scan_paths]
+    scans = [(s.st_size, s.st_mtime_ns, s.st_ctime_ns) for s in stats]
+    depends = str(sequence.folder.resolve()), scans, settings, dtype.descr
+    return hashlib.sha256(repr(depends).encode()).hexdigest()[:16]
+
+
+def _cache_row(path, compute, dtype):
+    """One scan file -> the bytes of its row in a cache file."""
+    scan, row = read_scan(path), np.zeros((), dtype)
+    row["scan_crc"] = zlib.crc32(scan)
+    try:
+        row["record"] = compute(scan)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    row["crc"] = zlib.crc32(row.tobytes()[:-4])
+    return row.tobytes()
+
+
+def _is_intact(file, dtype, n):
+    """Whether a cache file is there, of this dtype and length, and every checksum in it is right. Says so when it is damaged."""
+    if not file.is_file():
+        return False
+    try:
+        rows = np.load(file, mmap_mode="r")  # pickles are off, so no code runs
+        if rows.dtype == dtype and all(zlib.crc32(row[:-4]) == crc for row, crc in zip(rows.view(np.uint8).reshape(n, -1), rows["crc"])):
+            return True
+    except Exception:  # np.load raises many exception types; all of them mean a corrupt file
+        pass
+    print(f"{file}: damaged, it is made again", file=sys.stderr)
+    return False
+
+
+def fingerprint(sequence, scan_crcs):
+    """16 hex digits that identify the data of a sequence, wherever they lie: the CRC of every scan, and the poses."""
+    poses = b"" if sequence.poses_cam is None else sequence.poses_cam.tobytes()
+    return hashlib.sha256(scan_crcs.tobytes() + poses).hexdigest()[:16]
 
 
 # ---------------------------------------------------------------------------------------------------- the simulated city

@@ -7,7 +7,7 @@ leaderboard: E_t in percent, E_r in degrees per metre.
     python metrics.py poses/00.txt results/00.txt
     python metrics.py poses results --plot results/plot.png
 """
-import argparse, glob, os, platform, shutil, sys
+import argparse, glob, json, os, platform, shutil, sys
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -42,6 +42,13 @@ def replacing(path):
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_json(path, content):
+    """Write lists, dicts and numbers as JSON, through a temporary file; NaN, which JSON has not, becomes null."""
+    plain = json.loads(json.dumps(content), parse_constant=lambda nan: None)
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
 
 
 def read_poses(path: str | Path) -> np.ndarray:
