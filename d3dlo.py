@@ -690,7 +690,8 @@ def load_weights(path: str | Path | None = None, network=D3DLO, checkpoint: bool
                              f"this one reads {FORMAT}")
         net = network(Config(**state["config"]))
         net.load_state_dict(state["model"])
-        if not ({"step", "train", "before"} <= state.keys() and np.shape(state["mean_motion"]) == (6,)
+        if not ({"step", "train", "before"} <= state.keys()
+                and np.shape(state["mean_motion"]) == (6,)
                 and np.shape(state["seen"]) == (2, len(kitti.STATS))
                 and checksum(state["model"]) == state["crc"]):
             raise ValueError("damaged")
