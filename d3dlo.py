@@ -4,20 +4,22 @@ The network takes two consecutive LiDAR scans P and Q and predicts the rigid mot
 Read this file beside the paper, from top to bottom:
 
     1  Configuration            Table 1 and section 4
-    2  Sampling and grouping    sections 3.3.2 and 3.3.3; NumPy, since no weight is involved
+    2  Sampling and grouping    sections 3.3.2 and 3.3.3; NumPy, as nothing is learned here
     3  The network              section 3.3, eqs. 3 and 4, Fig. 1; PyTorch
     4  Training                 eq. 2 and section 4
     5  Odometry                 eq. 1
     6  Evaluation               section 5
-    7  The same functions, faster on a CPU. Skip it: it computes what parts 2 and 3 compute.
+    7  Faster versions of functions of parts 2 and 3, with the same results; can be skipped
     8  The command line
 
-kitti.py holds the six-vector of section 3.2 (`to_vector`), the ground plane of section 4, and all
-data; metrics.py holds E_t and E_r, eqs. 6 to 8.
+kitti.py converts motions to the vectors of section 3.2 (`to_vector`), finds the ground plane of
+section 4, and loads or simulates the data. metrics.py holds E_t and E_r, eqs. 6 to 8. What the
+paper tried and left out (eq. 5, quaternions, uncertainty weighting, multi-scale grouping) is in
+benchmarks/experiments.py. docs/paper-differences.md lists where we differ from the paper.
 
-Frame: Velodyne, x forward, y left, z up, in metres. T_ab maps points from frame b to frame a.
-Shapes: N points of a scan, S centroids, k neighbours, D or c features, C scans in a batch, B pairs
-of them.
+Frame: Velodyne, x forward, y left, z up, in metres. T_ab maps points from frame b to frame a;
+T_pq is the paper's T_{t,t+1}. Shapes: N points of a scan, S centroids, k neighbours, c features,
+C scans in a batch, B pairs of them; n1, n2, n3 are n_fps of SA1, SA2, SA3.
 
     python d3dlo.py train                       # simulated city, 10 minutes on two CPU cores
     python d3dlo.py train --data ROOT           # KITTI odometry, the paper's schedule
@@ -25,26 +27,23 @@ of them.
 """
 import argparse
 import copy
-import ctypes
 import functools
 import itertools
 import json
 import math
-import platform
-import shutil
-import subprocess
+import os
 import sys
 import time
 import warnings
 import zipfile
 import zlib
-from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 import torch
 import torch.nn.functional as F
 from scipy.spatial import cKDTree
@@ -55,6 +54,8 @@ import kitti
 import metrics
 from kitti import SPLITS, from_vector, invert, progress, to_vector
 
+__version__ = "0.2.0"
+
 # ------------------------------------------------------------------------------------------------
 # 1  Configuration: Table 1 and section 4
 
@@ -64,13 +65,13 @@ class Layer(NamedTuple):
 
     r: float | None  # radius of the ball [m]
     n_fps: int | None  # number of centroids kept by farthest point sampling
-    n_n: int | None  # number of neighbours of a centroid
+    n_n: int | None  # number of neighbours of a point, in a ball at most
     mlp: tuple  # output width of every linear layer
 
 
 @dataclass(frozen=True)
 class Config:
-    """Network, input and training. The defaults are the paper's, or fill in what it leaves open."""
+    """Network, input and training. The defaults are the paper's where it says something."""
 
     # Table 1         r    n_fps  n_n   MLP
     sa1: Layer = Layer(1.0, 1024, 8, (4, 8, 16, 32))
@@ -81,35 +82,35 @@ class Config:
     mlp: Layer = Layer(None, None, None, (64, 6))
 
     # Input
-    max_range: float = 50.0  # drop points farther away [m]; the paper does not
-    plane: bool = True  # keep the points on the ground plane, "pp" in Table 2
+    max_range: float | None = None  # drop points farther away [m]; None keeps whole scans
+    plane: bool = True  # keep the points of the ground plane, "pp" in Table 2
 
     # Training, section 4
     epochs: int = 500
     batch: int = 16  # pairs of scans in a batch; the paper does not say
-    optimizer: str = "adam"  # or "muon": Muon for the hidden matrices, Adam for the rest
-    lr: float = 1e-3  # Adam's default value; with "one-cycle" the highest learning rate
-    schedule: str = "steps"  # x 0.1 after 3/5 and 4/5 of the epochs; or "one-cycle"
-    swap: str = "both"  # use "both" directions of every pair; the paper picks one at "random"
-    augment: bool = False  # also mirror the pairs and move Q by small random motions
-    frozen: float = 0.0  # share of the steps, at the end, with fixed BatchNorm statistics
+    optimizer: str = "adam"  # ours: "muon", torch.optim.Muon for the matrices of hidden layers
+    lr: float = 1e-3  # learning rate: Adam's default; the highest of the "one-cycle" schedule
+    schedule: str = "steps"  # lr drops at epochs 300 and 400 of 500, to a tenth; ours: "one-cycle"
+    swap: str = "random"  # each pair in a random direction; ours: "both" directions
+    augment: bool = False  # ours: mirror pairs and move Q by small random motions
+    frozen: float = 0.0  # ours: last fraction of the steps, with BatchNorm statistics fixed
 
     def __post_init__(self):
-        for name in ("sa1", "fe", "sa2", "sa3", "mpn", "mlp"):  # JSON turns tuples into lists
+        for name in ("sa1", "fe", "sa2", "sa3", "mpn", "mlp"):  # JSON turned tuples into lists
             r, n_fps, n_n, mlp = getattr(self, name)
             object.__setattr__(self, name, Layer(r, n_fps, n_n, tuple(mlp)))
         check_config(self)
 
     def as_dict(self):
-        """Lists and numbers only, as JSON needs them. `Config(**d)` is the inverse."""
+        """A dict that JSON can hold. `Config(**d)` is the inverse."""
         return json.loads(json.dumps(asdict(self)))
 
 
 def check_config(config):
-    """ValueError, naming the setting, when a Config makes no sense."""
-    def require(sound, what):
-        if not sound:
-            raise ValueError(f"Config: {what}")
+    """Raise a ValueError that names the invalid setting."""
+    def require(condition, message):
+        if not condition:
+            raise ValueError(f"Config: {message}")
 
     def whole(x, most=2**31):
         return isinstance(x, int) and 1 <= x <= most
@@ -119,24 +120,27 @@ def check_config(config):
 
     sa1, fe, sa2, sa3, mlp = config.sa1, config.fe, config.sa2, config.sa3, config.mlp.mlp
     widths = [sa1.mlp, fe.mlp, sa2.mlp, sa3.mlp, config.mpn.mlp, mlp]
-    require(all(positive(sa.r) for sa in (sa1, sa2, sa3)), "every radius must be above 0 m")
-    require(all(whole(sa.n_fps, 65535) for sa in (sa1, sa2, sa3)), "n_fps must be 1 to 65,535")
+    require(all(positive(sa.r) for sa in (sa1, sa2, sa3)), "every radius must be positive")
+    require(all(whole(sa.n_fps, 65535) for sa in (sa1, sa2, sa3)), "n_fps must be 1 to 65,535")  # u2
     require(sa1.n_fps >= sa2.n_fps >= sa3.n_fps, "n_fps must not grow from layer to layer")
     require(all(whole(x.n_n, 1024) for x in (sa1, fe, sa2, sa3)), "n_n must be 1 to 1,024")
-    require(all(len(w) > 1 and all(map(whole, w)) for w in widths), "every MLP needs two widths")
-    require(mlp[-1] == 6, "the last width of mlp must be 6: three metres and three degrees")
-    require(positive(config.max_range), "max_range must be above 0 m")
-    require(whole(config.epochs) and whole(config.batch), "epochs and batch must be 1 or more")
-    require(positive(config.lr), "lr must be above 0")
-    require(0 <= config.frozen < 1, "frozen is a share, from 0 to below 1")
+    require(all(len(w) > 1 and all(map(whole, w)) for w in widths), "an MLP has 2 layers at least")
+    require(mlp[-1] == 6, "the last width of mlp must be 6: translation and angles")
+    require(config.max_range is None or positive(config.max_range), "max_range must be positive")
+    require(whole(config.epochs) and whole(config.batch), "epochs and batch must be whole numbers")
+    require(positive(config.lr), "lr must be positive")
+    require(config.frozen == 0 or positive(config.frozen) and config.frozen < 1,
+            "frozen must be a fraction, from 0 to below 1")
     require(config.optimizer in ("adam", "muon"), "optimizer must be adam or muon")
     require(config.schedule in ("steps", "one-cycle"), "schedule must be steps or one-cycle")
     require(config.swap in ("both", "random"), "swap must be both or random")
 
 
-# Our short recipe: 10 minutes on the simulated city.
-SHORT = dict(epochs=9, batch=8, optimizer="muon", lr=1e-2, schedule="one-cycle", augment=True,
-             frozen=0.25)
+# The settings of training, as opposed to those of the network and its input
+TRAINING = "epochs", "batch", "optimizer", "lr", "schedule", "swap", "augment", "frozen"
+# Our short recipe: 10 minutes on the simulated city
+SHORT = dict(max_range=50.0, epochs=9, batch=8, optimizer="muon", lr=1e-2, schedule="one-cycle",
+             swap="both", augment=True, frozen=0.25)
 
 # ------------------------------------------------------------------------------------------------
 # 2  Sampling and grouping: sections 3.3.2 and 3.3.3
@@ -145,8 +149,8 @@ SHORT = dict(epochs=9, batch=8, optimizer="muon", lr=1e-2, schedule="one-cycle",
 def fps_textbook(xyz, n, start=0):
     """Farthest point sampling: each new centroid is the point farthest from all centroids so far.
 
-    xyz (N,3) -> indices (n,) of the centroids. Ties go to the lowest index. This is the textbook
-    loop; `farthest_point_sampling` in part 7 returns the same indices faster.
+    xyz (N,3), index of the first centroid -> indices (n,) of the centroids. Ties go to the lowest
+    index. `farthest_point_sampling` in part 7 returns the same indices, faster, and is used instead.
     """
     centroids = np.empty(n, np.int64)
     centroids[0] = start
@@ -161,96 +165,101 @@ def fps_textbook(xyz, n, start=0):
 def group_ball(xyz: np.ndarray, centroids: np.ndarray, r: float, n_n: int, tree=None) -> np.ndarray:
     """The neighbours i of each centroid j in eq. 3: the nearest n_n points with |x_i - x'_j| <= r.
 
-    xyz (N,3) in metres, centroids (S,) indices into xyz -> (S,n_n) indices, nearest first, so the
-    first one is the centroid itself. Missing neighbours are replaced by the centroid: the paper
-    does so for an empty ball. Padding leaves the maximum unchanged but does affect BatchNorm's
-    statistics. `tree`: a cKDTree of xyz, if there is one already.
+    xyz (N,3) in metres, centroids (S,) indices into xyz -> (S,n_n) indices, nearest first. The
+    first one is the centroid itself, so no ball is empty. Where there are fewer than n_n, the rest
+    is filled with the centroid. These copies do not change the maximum in eq. 3, but they count in
+    the statistics of batch normalisation. `tree`: a cKDTree of xyz, if one has been built.
     """
     ranks = [*range(1, n_n + 1)]  # a list keeps the result two-dimensional for n_n = 1
     inclusive = np.nextafter(r, np.inf)  # scipy's bound is exclusive
     _, idx = (tree or cKDTree(xyz)).query(xyz[centroids], ranks, distance_upper_bound=inclusive)
-    return np.where(idx < len(xyz), idx, centroids[:, None])  # scipy marks missing ones by N
+    return np.where(idx < len(xyz), idx, centroids[:, None])  # scipy's index of no neighbour is N
 
 
 def group_knn(xyz: np.ndarray, query: np.ndarray, k: int) -> np.ndarray:
-    """The neighbours j of each point i in eq. 4: the k nearest, as section 3.3.3 ends.
+    """The neighbours j of each point i in eq. 4: the k nearest, not those in a ball.
 
-    xyz (N,3), query (S,3) -> (S,k) indices into xyz, nearest first. With fewer than k points the
-    nearest one is repeated.
+    xyz (N,3), query (S,3) -> (S,k) indices into xyz, nearest first. The nearest is repeated when
+    xyz has fewer than k points.
     """
     _, idx = cKDTree(xyz).query(query, [*range(1, k + 1)])
     return np.where(idx < len(xyz), idx, idx[:, :1])
 
 
 def geometry_dtype(config):
-    """What the network needs of a scan, as a NumPy record."""
+    """The record of a scan: what the network needs, and what is reported about it."""
     n1, n2, n3 = config.sa1.n_fps, config.sa2.n_fps, config.sa3.n_fps
     return np.dtype([
         ("xyz", "f4", (n1, 3)),  # centroids of SA1; the first n2 are SA2's, the first n3 SA3's
         ("group", "f4", (n1, config.sa1.n_n, 4)),  # SA1's neighbours: intensity f_i, x_i - x'_j [m]
         ("idx2", "u2", (n2, config.sa2.n_n)),  # SA2's neighbours, indices into SA1's centroids
         ("idx3", "u2", (n3, config.sa3.n_n)),  # SA3's neighbours, indices into SA2's centroids
-        ("broken", "i4"),  # number of points dropped because no LiDAR returns such
-        ("stats", "f4", len(kitti.STATS)),
+        ("broken", "i4"),  # number of points dropped that cannot be measurements
+        ("stats", "f4", len(kitti.STATS)),  # scan statistics, to warn about domain shift
     ])
 
 
 def scan_geometry(scan: np.ndarray, config: Config = Config()) -> np.ndarray:
     """Sampling and grouping of all three set abstractions: scan (N,4) -> `geometry_dtype` record.
 
-    No weight is involved, so this is done once for a scan and kept. FPS is nested: the first m
-    centroids of a sampling are the sampling of m centroids, so one sampling serves all layers.
-    ValueError when fewer than n_fps points are usable, see `kitti.usable_points`.
+    Nothing is learned here, so it is done once for every scan and kept. One sampling serves all
+    layers: SA2 samples SA1's centroids, which are in the order of sampling already, so it picks the
+    first n2 of them; SA3 picks the first n3. ValueError when too few points are usable.
     """
     sa1, sa2, sa3 = config.sa1, config.sa2, config.sa3
     scan, broken = kitti.usable_points(scan, config.max_range, config.plane)
     if len(scan) < sa1.n_fps:
-        raise ValueError(f"{len(scan)} usable points (finite, within {config.max_range} m"
+        reach = config.max_range or kitti.BROKEN_RANGE
+        raise ValueError(f"{len(scan)} usable points (finite, within {reach:.0f} m"
                          f"{'' if config.plane else ', off the ground'}), but the network needs "
                          f"{sa1.n_fps}; are the coordinates in metres?")
     cloud = np.ascontiguousarray(scan[:, :3])
-    centroids, tree = sample_and_index(cloud, sa1.n_fps)  # FPS, and a cKDTree of the cloud
+    centroids, tree = sample_and_index(cloud, sa1.n_fps)  # fps_textbook(...), cKDTree(cloud)
     neighbours = group_ball(cloud, centroids, sa1.r, sa1.n_n, tree)  # (n1,k1)
 
     out = np.zeros((), geometry_dtype(config))
     out["xyz"] = xyz = cloud[centroids]  # (n1,3)
     out["group"][..., 0] = scan[neighbours, 3]  # (n1,k1)
     out["group"][..., 1:] = cloud[neighbours] - xyz[:, None]  # (n1,k1,3)
-    out["idx2"] = group_ball(xyz, np.arange(sa2.n_fps), sa2.r, sa2.n_n)
-    out["idx3"] = group_ball(xyz[:sa2.n_fps], np.arange(sa3.n_fps), sa3.r, sa3.n_n)
+    first_n2, first_n3 = np.arange(sa2.n_fps), np.arange(sa3.n_fps)
+    out["idx2"] = group_ball(xyz, first_n2, sa2.r, sa2.n_n)
+    out["idx3"] = group_ball(xyz[first_n2], first_n3, sa3.r, sa3.n_n)
     out["broken"], out["stats"] = broken, kitti.scan_stats(scan, xyz)
     return out
 
 
 class Batch(NamedTuple):
-    """The network's input: C scans and B pairs (P, Q) of them, as tensors."""
+    """The network's input as tensors: C scans and B pairs (P, Q) of them.
+
+    Every scan can be P or Q of a pair, in either direction.
+    """
 
     xyz: torch.Tensor  # (C,n1,3) centroids
     group: torch.Tensor  # (C,n1,k1,4)
     idx2: torch.Tensor  # (C,n2,k2)
     idx3: torch.Tensor  # (C,n3,k3)
-    p: torch.Tensor  # (B,) which of the scans is P
-    q: torch.Tensor  # (B,) which of the scans is Q
+    p: torch.Tensor  # (B,) index of P among the scans
+    q: torch.Tensor  # (B,) index of Q among the scans
     idx_fe: torch.Tensor  # (B,n1,k) neighbours in Q of each centroid of P
 
 
 def make_batch(scans, p, q, config, device="cpu"):
-    """Records of scans (C,) and index arrays p, q (B,) -> Batch. Only `idx_fe` depends on pairs."""
-    xyz = scans["xyz"]
-    idx_fe = np.stack([group_knn(xyz[j], xyz[i], config.fe.n_n) for i, j in zip(p, q)])
-    idx2, idx3 = scans["idx2"].astype(np.int64), scans["idx3"].astype(np.int64)
-    arrays = Batch(xyz, scans["group"], idx2, idx3, p, q, idx_fe)
-    return Batch(*(torch.from_numpy(np.ascontiguousarray(array)).to(device) for array in arrays))
+    """Records of scans (C,) and index arrays p, q (B,) -> Batch."""
+    idx2, idx3 = scans["idx2"].astype(np.int64), scans["idx3"].astype(np.int64)  # for torch
+    arrays = scans["xyz"], scans["group"], idx2, idx3, p, q
+    xyz, *others = (to_device(array, device) for array in arrays)
+    idx_fe = neighbours_in_q(xyz, p, q, config.fe.n_n)  # `group_knn` for every pair
+    return Batch(xyz, *others, idx_fe)
 
 
 # ------------------------------------------------------------------------------------------------
 # 3  The network: section 3.3
 
 
-def shared_mlp(c, widths):
+def mlp_layers(c, widths):
     """h of eqs. 3 and 4: for each width a linear layer, batch normalisation and ReLU."""
     layers = []
-    for c_in, c_out in zip((c, *widths), widths):
+    for c_in, c_out in itertools.pairwise((c, *widths)):
         layers += [nn.Linear(c_in, c_out), nn.BatchNorm1d(c_out), nn.ReLU()]
     return nn.Sequential(*layers)
 
@@ -262,11 +271,11 @@ def gather(x, idx):
 
 
 class MiniPointNet(nn.Module):
-    """Section 3.3.1: the same MLP h for every point, then the maximum of each feature."""
+    """Section 3.3.1: the same MLP h for every point, then the maximum over all points."""
 
     def __init__(self, c, widths):
         super().__init__()
-        self.h = shared_mlp(c, widths)
+        self.h = mlp_layers(c, widths)
 
     def forward(self, f):
         """Features f (...,k,c) of k points -> (...,c')."""
@@ -289,7 +298,7 @@ class SetAbstraction(nn.Module):
 
 
 class FlowEmbedding(nn.Module):
-    """Section 3.3.3, eq. 4: e_i = max_j h_fe(f_i, g_j, y_j - x_i), j the neighbours of i in Q."""
+    """Section 3.3.3, eq. 4: e_i = max_j h_fe(f_i, g_j, y_j - x_i) over i's neighbours j in Q."""
 
     def __init__(self, c, layer):
         super().__init__()
@@ -306,8 +315,8 @@ class FlowEmbedding(nn.Module):
 class D3DLO(nn.Module):
     """The network of Fig. 1 and Table 1, with 61,290 parameters."""
 
-    # Section 3.2: a pose is three metres and three Euler angles in degrees. `encode` makes poses
-    # (...,4,4) regression targets (...,6), `decode` is its inverse. A subclass may choose others.
+    # Section 3.2: the output is a translation in metres and Euler angles in degrees. `encode` turns
+    # motions (...,4,4) into such vectors (...,6), `decode` is its inverse.
     encode, decode = staticmethod(to_vector), staticmethod(from_vector)
 
     def __init__(self, config: Config = Config()):
@@ -319,19 +328,23 @@ class D3DLO(nn.Module):
         self.sa3 = SetAbstraction(config.sa2.mlp[-1], config.sa3)
         self.mpn = MiniPointNet(config.sa3.mlp[-1], config.mpn.mlp)
         *hidden, out = config.mlp.mlp  # 64, 6
-        self.mlp = shared_mlp(config.mpn.mlp[-1], hidden)
+        self.mlp = mlp_layers(config.mpn.mlp[-1], hidden)
         self.mlp.append(nn.Linear(hidden[-1], out))
 
     def forward(self, batch: Batch) -> torch.Tensor:
         """Batch -> y_hat (B,6): [tx, ty, tz] in metres, [roll, pitch, yaw] in degrees, of T_pq."""
         p, q = batch.p, batch.q
-        f = self.sa1.mpn(batch.group)  # (C,1024,32), eq. 3; `scan_geometry` gathered the neighbours
-        x, y = batch.xyz[p], batch.xyz[q]  # (B,1024,3) centroids of P and Q
-        f, g = f.index_select(0, p), f.index_select(0, q)  # (B,1024,32) their features
-        e = self.fe(x, f, y, g, batch.idx_fe)  # (B,1024,64), eq. 4
-        e = self.sa2(x, e, batch.idx2[p])  # (B,256,64), eq. 3
-        x = x[:, :e.shape[1]]  # (B,256,3)
-        e = self.sa3(x, e, batch.idx3[p])  # (B,64,64), eq. 3
+        # SA1 for every scan, eq. 3; scan_geometry has gathered its neighbours.
+        features = self.sa1.mpn(batch.group)  # (C,1024,32)
+        # FE for every pair, eq. 4. (The backward pass of index_select is faster than of [p].)
+        x, f = batch.xyz[p], features.index_select(0, p)  # (B,1024,3), (B,1024,32) of P
+        y, g = batch.xyz[q], features.index_select(0, q)  # (B,1024,3), (B,1024,32) of Q
+        e = self.fe(x, f, y, g, batch.idx_fe)  # (B,1024,64)
+        # SA2 and SA3 on P, eq. 3
+        e = self.sa2(x, e, batch.idx2[p])  # (B,256,64)
+        x = x[:, :self.config.sa2.n_fps]  # (B,256,3)
+        e = self.sa3(x, e, batch.idx3[p])  # (B,64,64)
+        # Mini-PointNet and MLP
         global_feature = self.mpn(e)  # (B,256)
         return self.mlp(global_feature)  # (B,6)
 
@@ -394,8 +407,15 @@ def training_batch(geometry, motions, pairs, config, rng, device="cpu"):
 
 
 def steps_per_epoch(motions, config):
-    """Number of batches that hold every pair once."""
-    return math.ceil(sum(map(len, motions)) / config.batch)
+    """Number of batches in an epoch: every pair once, `config.batch` pairs or a few more in each.
+
+    ValueError when a batch would hold one direction of one pair, which has no batch statistics.
+    """
+    pairs = sum(map(len, motions))
+    if config.swap == "random" and min(pairs, config.batch) < 2:
+        raise ValueError(f"batches of {config.batch} pairs, {pairs} in all, one direction of each: "
+                         "batch normalisation needs at least 2 in a batch")
+    return max(1, pairs // config.batch)
 
 
 def batches(geometry, motions, config, seed, start, stop, device="cpu"):
@@ -442,109 +462,177 @@ def make_scheduler(optimizer, config, steps):
     return torch.optim.lr_scheduler.MultiStepLR(optimizer, decays, gamma=0.1)
 
 
-def training_state(net, objective, steps):
-    """Everything that training changes and a checkpoint holds: {name: object with a state_dict}."""
-    state = {"model": net, "objective": objective}
-    for i, optimizer in enumerate(make_optimizers(net, objective)):
-        state[f"optimizer{i}"] = optimizer
-        state[f"scheduler{i}"] = make_scheduler(optimizer, net.config, steps)
-    return state
+class Training:
+    """A training run (section 4): a network, its optimisers, and the files in RUN.
+
+    geometry: a list of records (n,), motions: a list of T_{t,t+1} (n-1,4,4), one for each sequence;
+    objective: a module (y_hat, y) -> loss, eq. 2 by default; facts: stored with the weights.
+    """
+
+    def __init__(self, net, geometry, motions, run, seed=0, device="cpu", objective=None, **facts):
+        self.net, self.config, self.device = net, net.config, device
+        self.model = for_device(net, device)  # shares the parameters of net
+        self.objective = (objective or UnweightedLoss()).to(device)
+        self.geometry, self.motions, self.seed = geometry, motions, seed
+        self.run, self.facts = Path(run), facts
+        self.per_epoch = steps_per_epoch(motions, self.config)
+        self.total = self.config.epochs * self.per_epoch
+        self.frozen_from = round(self.total * (1 - self.config.frozen))
+        self.step, self.losses, self.between_steps = 0, [], True
+        self.optimizers = make_optimizers(net, self.objective)
+        self.schedulers = [make_scheduler(o, self.config, self.total) for o in self.optimizers]
+
+    def batches(self):
+        """The batches that are left."""
+        return batches(self.geometry, self.motions, self.config, (self.seed,), self.step,
+                       self.total, self.device)
+
+    def examples(self):
+        """Some batches for BatchNorm's statistics, drawn with random numbers of their own."""
+        return batches(self.geometry, self.motions, self.config, (self.seed, 2**31), 0,
+                       min(25, self.total), self.device)
+
+    def advance(self, batch, T):
+        """One step: predict, compare, and change the weights. FloatingPointError for a bad loss."""
+        self.between_steps = False
+        if self.step == self.frozen_from:
+            update_bn(self.examples(), self.model)
+        self.model.train(self.step < self.frozen_from)
+        loss = self.objective(self.model(batch), targets(self.model, batch, T))
+        require_finite(loss.item())
+        self.model.zero_grad()
+        self.objective.zero_grad()
+        loss.backward()
+        for optimizer, scheduler in zip(self.optimizers, self.schedulers):
+            optimizer.step()
+            scheduler.step()
+        self.losses.append(loss.item())
+        self.step += 1
+        self.between_steps = True
+
+    def usable(self):
+        """A copy of the network in eval mode, and its twin for the device.
+
+        BatchNorm's running statistics lag behind the weights, so they are recomputed, unless they
+        were fixed before and the weights were trained with them.
+        """
+        net = copy.deepcopy(self.net)
+        twin = for_device(net, self.device)
+        if self.step <= self.frozen_from:
+            update_bn(self.examples(), twin)
+        return net.eval(), twin.eval()
+
+    def learning_rate(self):
+        """The learning rate of the next step."""
+        return self.optimizers[0].param_groups[0]["lr"]
+
+    def parts(self):
+        """Everything that training changes, by its name in a checkpoint."""
+        parts = {"model": self.net, "objective": self.objective}
+        for i, (optimizer, scheduler) in enumerate(zip(self.optimizers, self.schedulers)):
+            parts |= {f"optimizer{i}": optimizer, f"scheduler{i}": scheduler}
+        return parts
+
+    def load(self, checkpoint):
+        """Continue from the content of a checkpoint."""
+        self.step, self.losses = checkpoint["step"], checkpoint["losses"]
+        for name, part in self.parts().items():
+            part.load_state_dict(checkpoint[name])
+
+    def store_checkpoint(self):
+        """RUN/checkpoint.pt, to continue from."""
+        parts = {name: part.state_dict() for name, part in self.parts().items()}
+        save(self.run / "checkpoint.pt", config=self.config.as_dict(), step=self.step,
+             losses=self.losses, **self.facts, **parts)
+
+    def store_weights(self, net):
+        """RUN/weights.pt, a usable network."""
+        save(self.run / "weights.pt", net.state_dict(), config=self.config.as_dict(),
+             step=self.step, **self.facts)
+
+    @contextmanager
+    def kept(self):
+        """Store a checkpoint whatever ends the block, unless it ends in the middle of a step."""
+        try:
+            yield
+        except FloatingPointError as error:
+            raise ValueError(f"{self.run}: {error} at step {self.step}, learning rate "
+                             f"{self.learning_rate():.1e}; nothing is stored since; try a lower "
+                             "learning rate") from None
+        except BaseException:
+            if self.between_steps:
+                self.store_checkpoint()
+            raise
 
 
 def targets(net, batch, T):
-    """Poses T (B,4,4) as regression targets y (B,6), of the batch's type and on its device."""
-    return torch.from_numpy(net.encode(T)).to(batch.xyz)
+    """Poses T (B,4,4) as regression targets y (B,6), on the device of the batch."""
+    return to_device(net.encode(T).astype(np.float32), batch.xyz.device)
 
 
-def training_step(net, batch, T, state):
-    """Predict, compare, and change the weights. Returns the loss."""
-    _, objective, *optimizers_and_schedulers = state.values()
-    loss = objective(net(batch), targets(net, batch, T))
-    net.zero_grad()
-    objective.zero_grad()
-    loss.backward()
-    for part in optimizers_and_schedulers:
-        part.step()
-    return loss.item()
-
-
-def fit(net, geometry, motions, run, seed=0, device="cpu", checkpoint=None, say=print,
-        objective=None, **remember):
-    """Train `net` as `net.config` says (section 4). Returns the trained network in eval mode.
-
-    geometry: a list of records (n,), motions: a list of T_{t,t+1} (n-1,4,4), one for each sequence.
-    objective: a module (y_hat, y) -> loss, eq. 2 by default.
-
-    BatchNorm's running statistics lag behind the weights. They are recomputed at the end or, with
-    `config.frozen`, before the last share of the steps, which train with them fixed.
-
-    Every STORE_EVERY seconds and at the end, RUN/weights.pt and RUN/checkpoint.pt are written, with
-    `remember` in both; training continues from the content of a `checkpoint`. Ctrl-C lets the step
-    under way finish, stores the checkpoint and raises KeyboardInterrupt.
-    """
-    config, run = net.config, Path(run)
-    per_epoch = steps_per_epoch(motions, config)
-    total = config.epochs * per_epoch
-    frozen_from = round(total * (1 - config.frozen))
-    objective = (objective or UnweightedLoss()).to(device)
-    model = for_device(net, device)  # shares the parameters of net
-    state = training_state(net, objective, total)
-    step, losses = 0, []
-    if checkpoint:
-        step, losses = checkpoint["step"], checkpoint["losses"]
-        for name, part in state.items():
-            part.load_state_dict(checkpoint[name])
-
-    def examples():  # batches for BatchNorm's statistics, drawn with random numbers of their own
-        return batches(geometry, motions, config, (seed, 2**31), 0, min(25, total), device)
-
-    def store_weights():
-        final = copy.deepcopy(net)
-        if step <= frozen_from:
-            update_bn(examples(), for_device(final, device))
-        save(run / "weights.pt", final.state_dict(), config=config.as_dict(), step=step, **remember)
-        return final.eval()
-
-    def store_checkpoint():
-        parts = {name: part.state_dict() for name, part in state.items()}
-        save(run / "checkpoint.pt", config=config.as_dict(), step=step, losses=losses, **remember,
-             **parts)
-
-    stored = time.monotonic()
-    todo = batches(geometry, motions, config, (seed,), step, total, device)
-    what = f"training, batches of {config.batch} pairs, swap: {config.swap}"
-    with kitti.delayed_interrupt() as interrupted:
-        for batch, T in progress(todo, total - step, what):
-            if step == frozen_from:
-                update_bn(examples(), model)
-            rate = state["optimizer0"].param_groups[0]["lr"]
-            losses.append(training_step(model.train(step < frozen_from), batch, T, state))
-            step += 1
-            if step % per_epoch == 0:
-                say(f"epoch {step // per_epoch}/{config.epochs}: loss {np.mean(losses):.4f}, "
-                    f"learning rate {rate:.1e}")
-                losses = []
-            if interrupted:
-                break
-            if time.monotonic() - stored > STORE_EVERY:
-                store_checkpoint()
-                store_weights()
-                stored = time.monotonic()
-        store_checkpoint()
-        if interrupted:
-            raise KeyboardInterrupt(f"step {step} is stored; to continue: "
-                                    f"python d3dlo.py train --out {run} --resume")
-    final = store_weights()
-    loss = mean_loss(for_device(final, device), objective, examples())
-    say(f"training loss in eval mode: {loss:.4f}")
-    return final
+def require_finite(loss):
+    """FloatingPointError unless a loss is a finite number."""
+    if not math.isfinite(loss):
+        raise FloatingPointError("the loss is not finite")
 
 
 @torch.inference_mode()
 def mean_loss(net, objective, examples):
-    """The mean loss of a network over examples (Batch, T)."""
-    losses = [objective(net(batch), targets(net, batch, T)) for batch, T in examples]
-    return torch.stack(losses).mean().item()
+    """The mean loss over `examples`, an iterable of (Batch, T)."""
+    losses = [objective(net(batch), targets(net, batch, T)).item() for batch, T in examples]
+    require_finite(sum(losses))
+    return np.mean(losses)
+
+
+def held_out_examples(geometry, motions, config, device):
+    """Yield (Batch, T) of 500 pairs spread evenly over sequences, or of all if there are fewer."""
+    pairs = [(s, i) for s, T in enumerate(motions) for i in range(len(T))]
+    chosen = np.unique(np.linspace(0, len(pairs) - 1, 500).astype(int))
+    as_they_are = replace(config, swap="both", augment=False)
+    for part in np.array_split(chosen, math.ceil(len(chosen) / 16)):
+        some = [pairs[i] for i in part]
+        yield training_batch(geometry, motions, some, as_they_are, None, device)
+
+
+def fit(net, geometry, motions, run, seed=0, device="cpu", checkpoint=None, say=print,
+        objective=None, test=None, **facts):
+    """Train `net` as `net.config` says (section 4), see `Training`. Returns a usable network.
+
+    test: geometry and motions of the test sequences, whose loss is reported after every epoch and
+    used for nothing else. Every STORE_EVERY seconds and at the end, RUN/checkpoint.pt and
+    RUN/weights.pt are written; training continues from the content of a `checkpoint`. Ctrl-C lets
+    the step under way finish. ValueError when the loss is not finite; nothing is stored then.
+    """
+    training = Training(net, geometry, motions, run, seed, device, objective, **facts)
+    if checkpoint:
+        training.load(checkpoint)
+    left, stored = training.total - training.step, time.monotonic()
+    with kitti.delayed_interrupt() as interrupted, training.kept():
+        for batch, T in progress(training.batches(), left, "training, batches"):
+            rate = training.learning_rate()
+            training.advance(batch, T)
+            if training.step % training.per_epoch == 0:
+                loss, training.losses = np.mean(training.losses), []
+                epoch = training.step // training.per_epoch
+                line = f"epoch {epoch}/{net.config.epochs}: loss {loss:.4f}"
+                if test:
+                    _, twin = training.usable()
+                    examples = held_out_examples(*test, net.config, device)
+                    line += f", test loss {mean_loss(twin, training.objective, examples):.4f}"
+                say(f"{line}, learning rate {rate:.1e}")
+            if interrupted:
+                raise KeyboardInterrupt(f"step {training.step} is stored; to continue: "
+                                        f"python d3dlo.py train --out {run} --resume")
+            if time.monotonic() - stored > STORE_EVERY:
+                training.store_checkpoint()
+                training.store_weights(training.usable()[0])
+                stored = time.monotonic()
+        final, twin = training.usable()
+        loss = mean_loss(twin, training.objective, training.examples())
+        training.store_checkpoint()
+        training.store_weights(final)
+    say(f"training loss in eval mode: {loss:.4f}")
+    return final
 
 
 # ------------------------------------------------------------------------------------------------
@@ -603,11 +691,13 @@ class Odometry:
     """Poses from a stream of scans: `Odometry().register(scan)`.
 
     weights: a weights file or the folder of a training run, None for the weights beside this file;
-    refine: 0 for the paper's plain prediction, otherwise see `predict_refined`. ValueError or
-    FileNotFoundError for weights that cannot be read.
+    refine: 0 for the paper's plain prediction, otherwise see `predict_refined`. ValueError for an
+    argument that makes no sense, ValueError or FileNotFoundError for weights that cannot be read.
     """
 
     def __init__(self, weights: str | Path | None = None, device: str = "cpu", refine: int = 0):
+        check_device(device)
+        check_number("refine", refine)
         net, state = load_weights(weights)
         self.net, self.device, self.refine = for_device(net, device), device, refine
         self.seen = state["seen"]  # range of the scan statistics in training
@@ -796,32 +886,49 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     the class of the network. Returns the folder of the results. ValueError, OSError.
     """
     check_device(device)
+    check_number("refine", refine)
     net, state = load_weights(weights, network)
     if plot:
         metrics.picture(1, 1)  # fail now, and not after the work, when it cannot be drawn
-    out = Path(out or time.strftime("results/%Y-%m-%d-%H%M%S"))
     sequences = sequences or ("all" if data else ("test", "validation"))
     root = data_root(data, sequences)
+    out = kitti.new_name("results") if out is None else Path(out)
+    check_output(out, root)
     chosen = kitti.open_sequences(root, sequences)
     geometry, fingerprints = load_geometry(chosen, net.config)
     net = for_device(net, device)
+    clear_results(out)
     work = progress(zip(chosen, geometry), len(chosen), "registering, sequences")
     errors = {s.name: evaluate_sequence(net, state, s, records, out, device, refine)
               for s, records in work}
     seen = {*state["train"].values(), *state["before"]}  # by content: names may repeat
     results = summarize(errors, {s.name: f in seen for s, f in zip(chosen, fingerprints)})
-    source = {"weights": str(weights or WEIGHTS), "data": str(root), "refine": refine}
-    metrics.write_json(out / "results.json", source | results)
     say(results_table(results))
     say(f"trajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)\n"
         f"figures       {out}/results.json")
+    files = [f"{s.name}.txt" for s in chosen]
     if {f"{i}" for i in range(11, 22)} <= set(errors):  # KITTI's sequences without ground truth
         say(f"to submit     {zip_for_server(out)}")
+        files.append("kitti-server.zip")
     if plot:
         T = {s.name: (s.poses_cam, metrics.read_poses(out / f"{s.name}.txt")) for s in chosen}
         metrics.draw(out / "plot.png", T)
         say(f"picture       {out}/plot.png (from above in the camera's frame, errors by length)")
+        files.append("plot.png")
+    source = {"weights": str(weights or WEIGHTS), "data": str(root), "refine": refine}
+    metrics.write_json(out / "results.json", source | results | {"files": files})
     return out
+
+
+def clear_results(out):
+    """Delete what an earlier evaluation wrote to the folder OUT, as its results.json lists it."""
+    try:
+        files = json.loads((out / "results.json").read_text(encoding="utf-8"))["files"]
+    except (OSError, ValueError, KeyError, TypeError):  # none, or not one of ours
+        return
+    for name in [*files, "results.json"]:
+        if Path(name).name == name and (out / name).is_file():
+            (out / name).unlink()
 
 
 def zip_for_server(out):
@@ -923,6 +1030,33 @@ def fast(net):
 def for_device(net, device):
     """The network to run on a device: the fast twin on a CPU, elsewhere the plain network."""
     return fast(net) if torch.device(device).type == "cpu" else net.to(device)
+
+
+def to_device(array, device):
+    """NumPy array -> tensor. Copies to a GPU do not block."""
+    tensor = torch.from_numpy(np.ascontiguousarray(array))
+    if torch.device(device).type == "cuda":
+        tensor = tensor.pin_memory()
+    return tensor.to(device, non_blocking=True)
+
+
+def neighbours_in_q(xyz, p, q, k):
+    """Centroids xyz (C,n,3), index arrays p, q (B,) -> (B,n,k) neighbours in Q of those of P.
+
+    `group_knn` on a CPU. On another device they are found there, so that it need not wait.
+    """
+    if xyz.device.type == "cpu":
+        xyz = xyz.numpy()
+        return torch.from_numpy(np.stack([group_knn(xyz[j], xyz[i], k) for i, j in zip(p, q)]))
+    return knn_by_matrix(xyz[p], xyz[q], k)
+
+
+def knn_by_matrix(x, y, k):
+    """`group_knn` by a matrix of distances: x (B,S,3), y (B,n,3) -> (B,S,k) indices into y."""
+    distances = torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist")  # exact enough
+    idx = distances.topk(min(k, y.shape[1]), largest=False).indices  # (B,S,k), nearest first
+    missing = k - idx.shape[2]  # repeat the nearest when there are fewer than k points
+    return torch.cat([idx, idx[..., :1].expand(-1, -1, missing)], 2) if missing else idx
 
 
 class FastMiniPointNet(MiniPointNet):
@@ -1064,20 +1198,6 @@ def linear_norm_relu_max(linear, norm, h):
     return F.relu((z - mean) * (norm.weight.abs() * torch.rsqrt(var + norm.eps)) + norm.bias)
 
 
-def keep_freed_memory():
-    """Let glibc keep large freed blocks.
-
-    It would return them to the system and fault them in again at the next allocation, which is a
-    third of the time of a training step.
-    """
-    try:
-        libc = ctypes.CDLL(None)
-        libc.mallopt(-4, 0)  # M_MMAP_MAX: large blocks come from the heap too
-        libc.mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: the heap never shrinks
-    except (OSError, AttributeError, TypeError):  # another C library
-        pass
-
-
 # ------------------------------------------------------------------------------------------------
 # 8  The command line
 
@@ -1091,6 +1211,19 @@ def check_device(device):
     except (RuntimeError, AssertionError, NotImplementedError):
         raise ValueError(f"--device {device}: not available here; use cpu, or cuda or mps where "
                          "PyTorch has them") from None
+
+
+def check_number(name, value):
+    """ValueError unless a value is a whole number that fits, 0 or more."""
+    if not isinstance(value, int) or not 0 <= value < 2**63:
+        raise ValueError(f"{name} is {value!r}, but must be a whole number, 0 or more")
+
+
+def check_output(path, root):
+    """ValueError when a result would be written among the data, where it could replace the truth."""
+    for folder in (Path(root) / "sequences", Path(root) / "poses"):
+        if Path(path).resolve().is_relative_to(folder.resolve()):
+            raise ValueError(f"--out {path}: is in {folder}, where the data are; choose another")
 
 
 def data_root(data, names, whole=False):
@@ -1137,56 +1270,72 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     folder. ValueError, OSError.
     """
     check_device(device)
-    run = Path(out or time.strftime("runs/%Y-%m-%d-%H%M%S"))
-    config = config or Config(**({} if data else SHORT))
-    if resume:
-        config, data, sequences, seed, weights = read_run(run)
-    elif (run / "config.json").exists():
-        raise ValueError(f"{run}: holds a training run; add --resume to continue it, or choose "
-                         "another --out")
-    data, weights = (path and str(Path(path).resolve()) for path in (data, weights))
+    check_number("seed", seed)
+    run = kitti.new_name("runs") if out is None else Path(out)
+    with kitti.run_folder(run):
+        config = config or Config(**({} if data else SHORT))
+        if resume:
+            config, data, sequences, seed, weights = read_run(run)
+        elif (run / "config.json").exists():
+            raise ValueError(f"{run}: holds a training run; add --resume to continue it, or choose "
+                             "another --out")
+        data, weights = (path and str(Path(path).resolve()) for path in (data, weights))
+        net, checkpoint, before = starting_point(run, resume, weights, config, network, seed)
+        root = data_root(data, sequences, whole=True)
+        check_output(run, root)
+        chosen, held_out = choose_sequences(root, sequences)
+        # Held-out scans too, so that a broken one is found now and not after the training
+        geometry, prints = load_geometry(chosen + held_out, net.config)
+        n, motions = len(chosen), [s.motions() for s in chosen]
+        names = [s.name for s in chosen]
+        fingerprints = dict(zip(names, prints))
+        if checkpoint and checkpoint["train"] != fingerprints:
+            raise ValueError(f"{run}: the data have changed since this training run started; "
+                             "resume it with the data it was started with")
+        tested = [(records, s.motions()) for records, s in zip(geometry[n:], held_out)
+                  if s.name in SPLITS["test"] and s.poses is not None and len(s) > 1]
+        facts = training_facts(fingerprints, motions, geometry[:n], before)
+        arguments = dict(data=data, sequences=names, seed=seed, device=device, weights=weights)
+        write_run(run, arguments, net.config)
+
+        def say(line):
+            with open(run / "log.txt", "a", encoding="utf-8") as log:
+                log.write(line + "\n")
+            print(line, flush=True)
+
+        parameters, pairs = sum(p.numel() for p in net.parameters()), sum(map(len, motions))
+        say(f"{parameters:,} parameters, {pairs:,} pairs of scans of {' '.join(names)}, "
+            f"{net.config.epochs} epochs of {steps_per_epoch(motions, net.config)} batches "
+            f"-> {run}")
+        if not sequences and (missing := set(SPLITS["train"]) - set(names)):
+            say(f"of the training split {' '.join(sorted(missing))} are missing")
+        fit(net, geometry[:n], motions, run, seed, device, checkpoint, say, objective,
+            tuple(zip(*tested)), **facts)
+        if held_out:
+            evaluate(root, run, [s.name for s in held_out], run / "results", device, say=say,
+                     network=network)
+        say(f"weights       {run}/weights.pt\n"
+            f"next          python d3dlo.py eval --weights {run}"
+            + (f" --data {data}" if data else ""))
+    return run
+
+
+def starting_point(run, resume, weights, config, network, seed):
+    """What training begins with: a network, a checkpoint or None, and facts about earlier data.
+
+    That is the checkpoint of the run, or other weights, whose network and input are kept, or a new
+    network.
+    """
     stored = run / "checkpoint.pt"
-    checkpoint, net, before = None, None, {"train": {}, "before": [], "seen": []}
     if resume and stored.exists():
         net, checkpoint = load_weights(stored, network, checkpoint=True)
-        before = checkpoint | {"train": {}}
-    elif weights:
-        net, before = load_weights(weights, network)
-        config = replace(net.config, **{name: getattr(config, name) for name in SHORT})
+        return net, checkpoint, checkpoint | {"train": {}}
+    if weights:
+        net, state = load_weights(weights, network)
+        net.config = replace(net.config, **{name: getattr(config, name) for name in TRAINING})
+        return net, None, state
     torch.manual_seed(seed)
-    net = net or network(config)
-    net.config = config
-
-    root = data_root(data, sequences, whole=True)
-    chosen, held_out = choose_sequences(root, sequences)
-    names, motions = [s.name for s in chosen], [s.motions() for s in chosen]
-    # Held-out scans too, so that a broken one is found now and not after the training
-    geometry, fingerprints = load_geometry(chosen + held_out, config)
-    geometry, fingerprints = geometry[:len(chosen)], dict(zip(names, fingerprints))
-    if checkpoint and checkpoint["train"] != fingerprints:
-        raise ValueError(f"{run}: the data have changed since this training run started; resume it "
-                         "with the data it was started with")
-    remember = training_facts(fingerprints, motions, geometry, before)
-    arguments = dict(data=data, sequences=names, seed=seed, device=device, weights=weights)
-    write_run(run, arguments, config)
-
-    def say(line):
-        print(line, flush=True)
-        with open(run / "log.txt", "a", encoding="utf-8") as log:
-            log.write(line + "\n")
-
-    parameters, pairs = sum(p.numel() for p in net.parameters()), sum(map(len, motions))
-    say(f"{parameters:,} parameters, {pairs:,} pairs of scans of {' '.join(names)}, "
-        f"{config.epochs} epochs of {steps_per_epoch(motions, config)} batches -> {run}")
-    if not sequences and (missing := set(SPLITS["train"]) - set(names)):
-        say(f"of the training split {' '.join(sorted(missing))} are missing")
-    fit(net, geometry, motions, run, seed, device, checkpoint, say, objective, **remember)
-    if held_out:
-        evaluate(root, run, [s.name for s in held_out], run / "results", device, say=say,
-                 network=network)
-    say(f"weights       {run}/weights.pt\n"
-        f"next          python d3dlo.py eval --weights {run}" + (f" --data {data}" if data else ""))
-    return run
+    return network(config), None, {"train": {}, "before": [], "seen": []}
 
 
 def training_facts(fingerprints, motions, geometry, before):
@@ -1201,14 +1350,9 @@ def training_facts(fingerprints, motions, geometry, before):
 
 def write_run(run, arguments, config):
     """RUN/config.json: all that is needed to repeat a training run, or to resume it."""
-    here = Path(__file__).resolve().parent
-    git = shutil.which("git") if (here / ".git").exists() else None
-    code = git and subprocess.run([git, "-C", here, "describe", "--always", "--dirty"],
-                                  capture_output=True, text=True).stdout.strip()
-    versions = {"d3dlo": code, "python": platform.python_version(), "numpy": np.__version__,
-                "scipy": scipy.__version__, "torch": torch.__version__}
-    facts = {"arguments": arguments, "config": config.as_dict(), "versions": versions}
-    metrics.write_json(run / "config.json", facts)
+    versions = kitti.versions(Path(__file__).parent) | {"d3dlo": __version__}
+    content = {"arguments": arguments, "config": config.as_dict(), "versions": versions}
+    metrics.write_json(run / "config.json", content)
 
 
 def read_run(run):
@@ -1222,19 +1366,13 @@ def read_run(run):
                          "resume; name its folder by --out") from None
 
 
-def whole_number(text):
-    """A whole number, 0 or more, for argparse."""
-    if int(text) < 0:
-        raise argparse.ArgumentTypeError("must be 0 or more")
-    return int(text)
-
-
 def command_line(argv):
     """Arguments -> {option: value} of those that were given; the functions hold the defaults."""
     how = dict(formatter_class=argparse.RawDescriptionHelpFormatter,
                argument_default=argparse.SUPPRESS)
     title, *_, examples = __doc__.split("\n\n")
     parser = argparse.ArgumentParser(prog="d3dlo", description=f"{title}\n\n{examples}", **how)
+    parser.add_argument("--version", action="version", version=f"d3dlo {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="train | eval")
     train_options(commands.add_parser(
         "train", **how, help="train, then evaluate on the test and validation splits", description=(
@@ -1266,22 +1404,24 @@ def train_options(command):
     """The options of `train`."""
     data_options(command)
     add = command.add_argument_group("network").add_argument
-    add("--weights", metavar="FILE|RUN", help="start from these weights and keep their network")
+    add("--weights", metavar="FILE|RUN", help=(
+        "start from these weights and keep their network and input"))
     add("--neighbors", type=int, metavar="N", help=(
         f"n_n of the first set abstraction, Table 2 (default: {Config.sa1.n_n})"))
     add("--no-plane", action="store_false", dest="plane", help=(
         "remove the points of the ground plane, Table 2"))
     add = command.add_argument_group("training").add_argument
     add("--short", action="store_true", help=(
-        "our short recipe: few epochs, one-cycle learning rate, Muon, augmentation, BatchNorm "
-        "statistics fixed at the end (the default without --data)"))
+        "our short recipe, the default without --data: few epochs, points within 50 m, both "
+        "directions, Muon, one-cycle learning rate, augmentation, fixed BatchNorm statistics at "
+        "the end"))
     add("--epochs", type=int, metavar="N", help=(
         f"default: {Config.epochs}, short {SHORT['epochs']}"))
     add("--batch", type=int, metavar="N", help=(
         f"pairs in a batch (default: {Config.batch}, short {SHORT['batch']})"))
     add("--lr", type=float, metavar="X", help=(
         f"highest learning rate (default: {Config.lr}, short {SHORT['lr']})"))
-    add("--seed", type=whole_number, metavar="N", help=(
+    add("--seed", type=int, metavar="N", help=(
         "random seed for initialisation, pair order and augmentation (default: 0)"))
     add("--device", help="cpu, cuda or mps (default: cpu)")
     add = command.add_argument_group("run").add_argument
@@ -1296,7 +1436,7 @@ def eval_options(command):
     add = command.add_argument_group("network").add_argument
     add("--weights", metavar="FILE|RUN", help=(
         "weights, or the folder of a training run (default: those shipped)"))
-    add("--refine", type=whole_number, metavar="N", help=(
+    add("--refine", type=int, metavar="N", help=(
         "not in the paper: average both directions, then align the scans and predict the residual "
         "motion, N times (default: 0)"))
     add("--device", help="cpu, cuda or mps (default: cpu)")
@@ -1319,7 +1459,7 @@ def config_from(args):
 def main(argv=None):
     """The command line -> exit code: 0, 2 for bad input, 130 when interrupted."""
     args = command_line(argv)
-    keep_freed_memory()
+    kitti.keep_freed_memory()
     kitti.terminate_as_interrupted()
     try:
         if args.pop("command") == "eval":
@@ -1333,7 +1473,12 @@ def main(argv=None):
         advice = str(interrupt) or "run the same command again"
         print(f"\nd3dlo: interrupted; {advice}", file=sys.stderr)
         return 130
-    except (ValueError, OSError, BrokenExecutor) as error:
+    except BrokenPipeError:
+        sys.stdout = open(os.devnull, "w")  # nobody reads it any more; Python would complain
+        print("d3dlo: standard output was closed; a training run has left a checkpoint and "
+              "continues by train --out RUN --resume", file=sys.stderr)
+        return 2
+    except (ValueError, OSError) as error:
         print(f"d3dlo: {error}", file=sys.stderr)
         return 2
     return 0

@@ -7,9 +7,10 @@ in the Velodyne frame, because that is what the points are in: T_velo = inv(Tr) 
     python kitti.py simulate data/city      # an HDL-64E drives through 11 little cities, with exact ground truth: 2,620 scans, 4.2 GB
     python kitti.py simulate data/tiny --sequences 00 07 --scans 40 --azimuth 900
 """
-import argparse, functools, hashlib, json, os, re, shutil, signal, sys, threading, time, warnings, zlib
+import argparse, ctypes, functools, hashlib, importlib.metadata, itertools, json, os, platform, re, shutil, signal, subprocess, sys
+import threading, time, warnings, zlib
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,11 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from metrics import read_poses, replacing, temporary_beside, write_poses
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
 
 SPLITS = {"train": ("00", "01", "02", "08", "09"), "test": ("03", "04", "05", "06", "10"), "validation": ("07",)}  # paper, section 4
 
@@ -271,20 +277,94 @@ def progress(items, total, what):
 
 
 def cores():
-    """Cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Cores this process may use; at most 61, the most worker processes that Windows allows."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(count, 61)
 
 
-def worker_starts():
-    """For the processes of a pool."""
+def in_processes(function, tasks, workers=None, chunksize=4):
+    """Yield function(task) for every task, in order, computed by a pool of worker processes.
+
+    OSError when a worker process died."""
+    pool = ProcessPoolExecutor(workers or cores(), initializer=_worker_starts)
+    try:
+        yield from pool.map(function, tasks, chunksize=chunksize)
+    except BrokenExecutor:
+        raise OSError("a worker process died. A script needs the line if __name__ == '__main__': before its main part where "
+                      "processes are spawned, as on macOS and Windows; otherwise look for a lack of memory") from None
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _worker_starts():
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which stops its workers
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def terminate_as_interrupted():
-    """From here on SIGTERM is as Ctrl-C, which leaves through every `finally`."""
+    """Treat SIGTERM like Ctrl-C from now on, so that every `finally` runs."""
     if threading.current_thread() is threading.main_thread():  # Python's rule for signals
         signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+
+def keep_freed_memory():
+    """Let glibc keep large freed blocks.
+
+    It would return them to the system and fault them in again at the next allocation, which is a third of the time of a
+    training step on a CPU."""
+    try:
+        libc = ctypes.CDLL(None)
+        libc.mallopt(-4, 0)  # M_MMAP_MAX: large blocks come from the heap too
+        libc.mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: the heap never shrinks
+    except (OSError, AttributeError, TypeError):  # another C library
+        pass
+
+
+def versions(folder):
+    """Versions of Python and the packages, and the git commit of the code in `folder`, where there is one."""
+    git = shutil.which("git") if (Path(folder) / ".git").exists() else None
+    commit = git and subprocess.run([git, "-C", folder, "describe", "--always", "--dirty"], capture_output=True, text=True).stdout.strip()
+    packages = {name: importlib.metadata.version(name) for name in ("numpy", "scipy", "torch")}
+    return {"commit": commit, "python": platform.python_version(), **packages}
+
+
+def new_name(parent):
+    """A path PARENT/TIME that does not exist yet."""
+    path = first = Path(parent) / time.strftime("%Y-%m-%d-%H%M%S")
+    for i in itertools.count(2):
+        if not path.exists():
+            return path
+        path = first.with_name(f"{first.name}-{i}")
+
+
+@contextmanager
+def run_folder(path):
+    """Make a folder and hold it for one writer: ValueError while another process does. An empty one is removed at the end.
+
+    The holder locks the file PATH/lock, which nothing else opens; the system unlocks it when the process ends, however it
+    ends. Without fcntl, as on Windows, nothing is locked."""
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    path.mkdir(parents=True, exist_ok=True)
+    lock = open(path / "lock", "a+", encoding="utf-8")
+    with lock:
+        if fcntl:
+            try:
+                fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                lock.seek(0)
+                raise ValueError(f"{path}: another training run writes to it, {lock.read().strip() or 'just started'}; wait for "
+                                 "its end, or choose another folder") from None
+        lock.truncate(0)
+        lock.write(f"process {os.getpid()} on {platform.node()}\n")
+        lock.flush()
+        try:
+            yield
+        finally:
+            if made and [p.name for p in path.iterdir()] == ["lock"]:
+                (path / "lock").unlink()
+                with suppress(OSError):  # another process has just begun to use it
+                    for folder in made:
+                        folder.rmdir()
 
 
 @contextmanager
@@ -325,9 +405,8 @@ def cached_records(sequences, compute, dtype, settings, cache="cache"):
     missing = [(s, file) for s, file in zip(sequences, files) if not _is_intact(file, stored, len(s))]
     if missing:
         paths = [path for s, _ in missing for path in s.scan_paths]
-        pool = ProcessPoolExecutor(cores(), initializer=worker_starts)
-        try:
-            rows = pool.map(functools.partial(_cache_row, compute=compute, dtype=stored), paths, chunksize=4)
+        row_of = functools.partial(_cache_row, compute=compute, dtype=stored)
+        with closing(in_processes(row_of, paths)) as rows:
             rows = progress(rows, len(paths), "sampling and grouping, scans")
             for s, file in missing:
                 header = {"descr": np.lib.format.dtype_to_descr(stored), "fortran_order": False, "shape": (len(s),)}
@@ -336,8 +415,6 @@ def cached_records(sequences, compute, dtype, settings, cache="cache"):
                     for _ in range(len(s)):
                         out.write(next(rows))
             next(rows, None)  # lets the progress line end
-        finally:
-            pool.shutdown(cancel_futures=True)
     loaded = [np.load(file, mmap_mode="r") for file in files]
     return [rows["record"] for rows in loaded], [np.array(rows["scan_crc"]) for rows in loaded]
 
@@ -758,7 +835,8 @@ def _simulate_scan(name, seed, scans, azimuth, i):
     return np.stack([x, y, z, np.round(np.clip(light, 0, 0.99), 2)], axis=1)  # (N,4)
 
 
-def _save_scan(path, name, settings, i):
+def _save_scan(task):
+    path, name, settings, i = task
     _simulate_scan(name, settings["seed"], settings["scans"], settings["azimuth"], i).tofile(path)
 
 
@@ -810,19 +888,18 @@ def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range
     # one name per process: two of them may fill the same ROOT, and whoever finishes a sequence first has made it
     temporary = {n: temporary_beside(root / "sequences" / n) for n in jobs if not (root / "sequences" / n).exists()}
     tasks = [(folder / "velodyne" / f"{i:06d}.bin", n, jobs[n], i) for n, folder in temporary.items() for i in range(jobs[n]["scans"])]
-    workers = int(workers or cores())
-    pool = ProcessPoolExecutor(workers, initializer=worker_starts) if workers > 1 and len(tasks) > 8 else None
+    in_pool = (workers or cores()) > 1 and len(tasks) > 8
+    saved = in_processes(_save_scan, tasks, workers, chunksize=8) if in_pool else map(_save_scan, tasks)
     try:
         for folder in temporary.values():
             shutil.rmtree(folder, ignore_errors=True)  # of an earlier process of the same number
             (folder / "velodyne").mkdir(parents=True)
-        saved = pool.map(_save_scan, *zip(*tasks), chunksize=8) if pool else (_save_scan(*task) for task in tasks)
-        saved = progress(saved, len(tasks), "simulating")
+        made = progress(saved, len(tasks), "simulating")
         for name, settings in jobs.items():
             T, folder = _world(name, settings["seed"], settings["scans"])[0], root / "sequences" / name
             if name in temporary:
                 for _ in range(len(T)):
-                    next(saved)
+                    next(made)
                 (temporary[name] / "calib.txt").write_text(calib)
                 (temporary[name] / "times.txt").write_text("".join(f"{0.1 * i:.6e}\n" for i in range(len(T))))
                 (temporary[name] / "simulated.json").write_text(json.dumps(settings))
@@ -834,10 +911,10 @@ def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range
             if (folder / "simulated.json").read_text() != json.dumps(settings):
                 raise ValueError(f"{folder} was made meanwhile, with other settings: choose another folder.")
             write_poses(root / "poses" / f"{name}.txt", velo_to_camera(invert(T[0]) @ T, Tr))  # last: without it a sequence is not complete
-        next(saved, None)  # lets the progress line end
+        next(made, None)  # lets the progress line end
     finally:
-        if pool:
-            pool.shutdown(cancel_futures=True)
+        if in_pool:
+            saved.close()
         for folder in temporary.values():
             shutil.rmtree(folder, ignore_errors=True)
     return root
@@ -857,7 +934,7 @@ def main(argv=None):
     try:
         simulate(args.dir, args.seed, args.sequences, args.scans, args.azimuth)
         made = open_sequences(args.dir, args.sequences)
-    except (ValueError, OSError, BrokenExecutor) as error:
+    except (ValueError, OSError) as error:
         print(f"kitti.py: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:

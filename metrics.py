@@ -7,7 +7,7 @@ leaderboard: E_t in percent, E_r in degrees per metre.
     python metrics.py poses/00.txt results/00.txt
     python metrics.py poses results --plot results/plot.png
 """
-import argparse, glob, json, os, platform, shutil, sys
+import argparse, codecs, glob, json, os, platform, shutil, sys
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -33,13 +33,21 @@ def temporary_beside(path):
 
 @contextmanager
 def replacing(path):
-    """Yields a temporary path beside `path`, moved onto it when the block ends well: never a half-written file."""
+    """Yields a temporary path beside `path`, moved onto it when the block ends well: never a half-written file.
+
+    OSError, naming the file, when that fails, or when `path` is something else than a regular file."""
     path = Path(path)
+    if path.exists() and not path.is_file():
+        raise OSError(f"{path}: is not a regular file, so it is not replaced; choose another name")
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = temporary_beside(path)
     try:
         yield temporary
         os.replace(temporary, path)
+    except OSError as error:
+        if error.filename is None and error.strerror:      # as when the disk is full
+            raise OSError(error.errno, error.strerror, str(path)) from None
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -48,12 +56,15 @@ def write_json(path, content):
     """Write lists, dicts and numbers as JSON, through a temporary file; NaN, which JSON has not, becomes null."""
     plain = json.loads(json.dumps(content), parse_constant=lambda nan: None)
     with replacing(path) as temporary:
-        temporary.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8", newline="\n")
 
 
 def read_poses(path: str | Path) -> np.ndarray:
     """A KITTI pose file, 12 numbers a row (the top three rows of a 4x4), as (n,4,4) float64. ValueError, FileNotFoundError."""
-    rows = [(number, line.split()) for number, line in enumerate(Path(path).read_bytes().splitlines(), 1) if line.strip()]
+    text = Path(path).read_bytes().removeprefix(codecs.BOM_UTF8)
+    if text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise ValueError(f"{path}: is UTF-16 text; save it as UTF-8")
+    rows = [(number, line.split()) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
     if not rows:
         raise ValueError(f"{path}: holds no pose")
     T = np.tile(np.eye(4), (len(rows), 1, 1))                                       # (n,4,4)
@@ -74,8 +85,8 @@ def read_poses(path: str | Path) -> np.ndarray:
 
 def write_poses(path: str | Path, T: np.ndarray) -> None:
     """Write (n,4,4) poses as a KITTI pose file, through a temporary file."""
-    with replacing(path) as temporary:
-        np.savetxt(temporary, np.asarray(T)[:, :3].reshape(-1, 12), fmt="%.9e")
+    with replacing(path) as temporary, open(temporary, "w", newline="\n") as file:
+        np.savetxt(file, np.asarray(T)[:, :3].reshape(-1, 12), fmt="%.9e")
 
 
 def _same_length(T_gt, T_est):

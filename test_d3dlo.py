@@ -3,6 +3,7 @@ form. Real data are optional: D3DLO_KITTI names a folder in KITTI odometry layou
 import argparse, contextlib, copy, json, math, os, pickle, re, runpy, shutil, signal, subprocess, sys, warnings, zipfile
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,7 +29,8 @@ HERE = Path(__file__).resolve().parent
 KITTI = Path(os.environ.get("D3DLO_KITTI", "no folder")).resolve()        # real data in KITTI's layout, for whoever has some
 # every kind of layer, a hundredth of the work
 SMALL = Config(sa1=Layer(2.0, 32, 4, (4, 8, 16)), fe=Layer(None, None, 6, (16, 32)), sa2=Layer(4.0, 16, 8, (32, 32)),
-               sa3=Layer(8.0, 8, 4, (32, 32)), mpn=Layer(None, None, None, (32, 64)), mlp=Layer(None, None, None, (32, 6)))
+               sa3=Layer(8.0, 8, 4, (32, 32)), mpn=Layer(None, None, None, (32, 64)), mlp=Layer(None, None, None, (32, 6)),
+               max_range=50.0, swap="both")
 generator = np.random.default_rng
 
 
@@ -366,9 +368,10 @@ def test_sixteen_pairs_can_be_learned_by_heart(tmp_path, frozen):
     assert np.abs(got - to_vector(np.concatenate(motions))).mean() < 0.02           # and by the path that odometry takes
 
 
-@given(SEED, st.sampled_from(["both", "random"]), st.booleans(), st.integers(1, 9))
+@given(SEED, st.sampled_from(["both", "random"]), st.booleans(), st.integers(2, 12))
 def test_batches_depend_on_seed_and_step_alone(seed, swap, augmented, batch):
-    config, (geometry, motions), steps = replace(SMALL, swap=swap, augment=augmented, batch=batch), drives(), 2 * math.ceil(10 / batch)
+    config, (geometry, motions) = replace(SMALL, swap=swap, augment=augmented, batch=batch), drives()
+    steps = 2 * d3dlo.steps_per_epoch(motions, config)
 
     def made(seed, start, stop):
         return [b"".join(np.asarray(part).tobytes() for part in (*batch, T))
@@ -376,15 +379,16 @@ def test_batches_depend_on_seed_and_step_alone(seed, swap, augmented, batch):
     whole = made(seed, 0, steps)                        # two epochs
     assert all(made(seed, k, steps) == whole[k:] for k in (0, 1, steps // 2, steps - 1))
     assert made(seed + 1, 0, 1) != whole[:1]
-    alone = d3dlo.batches([geometry[0][:2]], [motions[0][:1]], config, (seed,), 0, 2)           # two epochs of one pair: it is drawn anew
-    assert not augmented or len({T.tobytes() for _, T in alone}) == 2
+    two = d3dlo.batches([geometry[0][:3]], [motions[0][:2]], config, (seed,), 0, 2)             # two epochs of two pairs: drawn anew
+    assert not augmented or len({T.tobytes() for _, T in two}) == 2
 
 
-@given(SEED, st.sampled_from(["both", "random"]), st.integers(1, 9))
+@given(SEED, st.sampled_from(["both", "random"]), st.integers(2, 12))
 def test_an_epoch_holds_every_pair_once_with_the_motion_of_its_direction(seed, swap, batch):
     config, (geometry, motions) = replace(SMALL, swap=swap, batch=batch), drives()
     name, seen = {g["xyz"].tobytes(): (s, i) for s, records in enumerate(geometry) for i, g in enumerate(records)}, []
-    for b, T_pq in d3dlo.batches(geometry, motions, config, (seed,), 0, math.ceil(10 / batch)):
+    for b, T_pq in d3dlo.batches(geometry, motions, config, (seed,), 0, d3dlo.steps_per_epoch(motions, config)):
+        assert len(T_pq) >= min(batch, 10)              # no small batch is left over
         for p, q, T in zip(b.p, b.q, T_pq, strict=True):
             (s, i), (s_, j) = (name[b.xyz[c].numpy().tobytes()] for c in (p, q))
             expected = motions[s][min(i, j)]
@@ -394,7 +398,19 @@ def test_an_epoch_holds_every_pair_once_with_the_motion_of_its_direction(seed, s
         assert swap != "both" or 2 * len({pair[:2] for pair in seen}) == len(seen)        # both directions in one batch
     assert sorted({pair[:2] for pair in seen}) == [(s, i) for s in range(2) for i in range(5)]
     assert len(seen) == len(set(seen)) == (20 if swap == "both" else 10)
-    assert {forward for *_, forward in seen} == {True, False}
+    assert swap == "random" or {forward for *_, forward in seen} == {True, False}
+
+
+def test_the_direction_of_a_pair_is_random():
+    (geometry, motions), config = drives(), replace(SMALL, swap="random", batch=10)
+    first = [(b.p[0] < b.q[0]).item() for b, _ in d3dlo.batches(geometry, motions, config, (0,), 0, 40)]
+    assert 8 < sum(first) < 32                          # 20 are expected, with a standard deviation of 3
+
+
+@pytest.mark.parametrize("batch, pairs", [(1, 10), (16, 1)])
+def test_batches_of_one_directed_pair_are_refused(batch, pairs):
+    with pytest.raises(ValueError, match="at least 2"):
+        d3dlo.steps_per_epoch([np.zeros((pairs, 4, 4))], replace(SMALL, swap="random", batch=batch))
 
 
 @given(SEED)
@@ -426,7 +442,7 @@ def fit(folder, config, resume=None):
     (None, 7, "steps", "adam", 0), (None, 7, "one-cycle", "muon", 8 / 15),  # at once: there is only what was stored before
     (signal.SIGINT, 8, "steps", "adam", 7 / 15), (signal.SIGTERM, 8, "one-cycle", "muon", 0.6)])
 def test_a_training_goes_on_as_if_never_stopped_and_a_finished_one_stays(tmp_path, monkeypatch, stop, stored, schedule, optimizer, frozen):
-    config = replace(SMALL, epochs=5, batch=4, schedule=schedule, optimizer=optimizer, augment=True, frozen=frozen)
+    config = replace(SMALL, epochs=5, batch=3, schedule=schedule, optimizer=optimizer, augment=True, frozen=frozen)
     steps, loss_of = [], d3dlo.UnweightedLoss.forward
 
     def loss_with_a_stop(*arguments):
@@ -833,7 +849,7 @@ def test_train_then_eval_then_train_again(here, city, capsys):
     assert d3dlo.main(arguments) == 0
     out, err = capsys.readouterr()
     assert complaint(err) == [] and "61,290 parameters" in out and not list(here.rglob(".*"))
-    assert {"weights.pt", "checkpoint.pt", "config.json", "log.txt", "results"} == set(os.listdir("run"))
+    assert {"weights.pt", "checkpoint.pt", "config.json", "lock", "log.txt", "results"} == set(os.listdir("run"))
     trained, before = json.loads((here / "run" / "results" / "results.json").read_text()), (here / "run" / "checkpoint.pt").read_bytes()
     assert figures(out, "07") == as_printed(trained["sequences"]["07"]) and (here / "run" / "log.txt").read_text() == out
     assert d3dlo.main(["eval", "--data", "data", "--weights", "run", "--out", "out"]) == 0
@@ -855,7 +871,7 @@ def test_a_training_from_weights_begins_with_them_and_remembers_what_they_saw(he
     d3dlo.train(replace(SMALL, epochs=1), "first", out="a")
     d3dlo.train(Config(epochs=1, lr=1e-12), "later", out="b", weights="a")
     (a, seen_a), (b, seen_b) = (load_weights(run) for run in "ab")
-    assert b.config == replace(a.config, epochs=1, batch=16, lr=1e-12) and a.config.sa1.n_fps == 32
+    assert b.config == replace(a.config, epochs=1, batch=16, swap="random", lr=1e-12) and a.config.sa1.n_fps == 32
     assert all(torch.allclose(x, y, atol=1e-9) for x, y in zip(a.parameters(), b.parameters(), strict=True))
     assert list(seen_a["train"].values()) == seen_b["before"] and seen_a["train"] != seen_b["train"]
     (low_a, high_a), (low_b, high_b) = seen_a["seen"], seen_b["seen"]
@@ -1002,6 +1018,240 @@ def test_pictures_are_drawn_where_there_is_matplotlib(here, monkeypatch, capsys)
     metrics.draw("b.png", {"11": (None, T)})                                        # without ground truth
     assert all(Path(name).read_bytes().startswith(b"\x89PNG") for name in ("a.png", "b.png"))
 
+
+# --------------------------------------------------------------------- the paper's experiments
+
+experiments = SimpleNamespace(**runpy.run_path(str(HERE / "benchmarks" / "experiments.py")))
+TWO_BALLS = replace(SMALL, sa1=Layer(2.0, 32, 12, (4, 8, 16)))  # 12 within 2 m, 3 within 1 m
+REJECTED = {"quaternion": (experiments.Quaternion, SMALL),
+            "coordinates": (experiments.Coordinates, SMALL),
+            "two scales": (experiments.TwoScales, TWO_BALLS)}
+
+
+@table("network, parameters", {
+    "quaternion": (experiments.Quaternion, 61290 + 65),
+    "coordinates": (experiments.Coordinates, 61290 + 3 * 64),
+    "two scales": (experiments.TwoScales, 61290 + 868 + 2 * 32 * 32)})  # SA1 twice, a wider FE
+def test_parameters_of_the_rejected_networks(network, parameters):
+    for config in (Config(), Config(**experiments.TWO_SCALES)):  # neighbours do not matter
+        assert count(network(config)) == parameters
+
+
+@table("network, config", REJECTED)
+@pytest.mark.parametrize("training", [True, False])
+@given(seed=SEED)
+@settings(max_examples=10)
+def test_the_fast_twin_of_a_rejected_network_equals_the_plain_one(training, network, config, seed):
+    rng = generator(seed)
+    net = a_net(rng, config, network).double()
+    plain, fast = copy.deepcopy(net).train(training), d3dlo.fast(net).train(training)
+    batch = in_double(a_batch(rng, config)[0])
+    expected, got = plain(batch), fast(batch)
+    torch.testing.assert_close(got, expected, rtol=1e-9, atol=1e-9)
+    assert got.std(0).max() > 1e-3  # the predictions differ from pair to pair
+    weights = torch.from_numpy(rng.normal(size=expected.shape))
+    names, parameters = zip(*net.named_parameters())  # shared by net and fast
+    expected = torch.autograd.grad((expected * weights).sum(), [*plain.parameters()])
+    got = torch.autograd.grad((got * weights).sum(), parameters)
+    expected, got = dict(zip(names, expected)), dict(zip(names, got))
+    torch.testing.assert_close(got, expected, rtol=1e-6, atol=1e-8)
+    expected, got = dict(plain.state_dict()), dict(net.state_dict())  # running statistics too
+    torch.testing.assert_close(got, expected, rtol=1e-9, atol=1e-9)
+    slow = {d3dlo.MiniPointNet, d3dlo.SetAbstraction, d3dlo.FlowEmbedding}
+    assert not slow & {type(module) for module in fast.modules()}
+
+
+@given(SEED, st.sampled_from([200, 600, 3000]))
+def test_two_scales_group_both_balls_as_group_ball_does(seed, N):
+    rng = generator(seed)
+    scan, mpn = cloud(rng, N), a_net(rng, TWO_BALLS, experiments.TwoScales).sa1.mpn
+    xyz = scan[:, :3]
+    centroids = farthest_point_sampling(xyz, 32)
+
+    def features(r, n_n):
+        idx = group_ball(xyz, centroids, r, n_n)
+        offsets = xyz[idx] - xyz[centroids][:, None]
+        return torch.from_numpy(np.concatenate([scan[idx, 3:], offsets], -1))
+    expected = torch.cat([mpn.small(features(1.0, 3)), mpn.large(features(2.0, 12))], -1)
+    group = torch.from_numpy(scan_geometry(scan, TWO_BALLS)["group"])
+    torch.testing.assert_close(mpn(group[None])[0], expected, rtol=1e-5, atol=1e-5)
+    assert expected.shape == (32, 2 * 16)
+
+
+@given(SEED)
+def test_coordinates_of_the_centroids_reach_the_mini_pointnet(seed):
+    rng = generator(seed)
+    net, batch = a_net(rng, SMALL, experiments.Coordinates), a_batch(rng)[0]
+    seen = {}
+    net.sa3.sa.register_forward_hook(lambda module, inputs, output: seen.update(sa3=output))
+    net.mpn.register_forward_pre_hook(lambda module, inputs: seen.update(mpn=inputs[0]))
+    net(batch)
+    expected = torch.cat([seen["sa3"], batch.xyz[batch.p][:, :8] / 10], -1)
+    torch.testing.assert_close(seen["mpn"], expected, rtol=0, atol=0)
+
+
+@given(SEED)
+def test_only_with_coordinates_does_the_prediction_depend_on_where_both_scans_are(seed):
+    rng = generator(seed)
+    batch = in_double(a_batch(rng)[0])
+    elsewhere = batch._replace(xyz=batch.xyz + torch.tensor([20.0, -10.0, 0.0]))
+    with torch.no_grad():
+        table_1, coordinates = (
+            (net(elsewhere) - net(batch)).abs().max()
+            for net in (a_net(rng, SMALL, n).double() for n in (D3DLO, experiments.Coordinates)))
+    assert table_1 < 1e-9 and coordinates > 1e-3
+
+
+def l1(y_hat, y):
+    return np.mean(np.abs(y_hat - y))
+
+
+def eq_5(y_hat, y):
+    """Mean over the pairs; a length below 0.001 counts as 0.001."""
+    lengths = [np.maximum(np.linalg.norm(part, axis=1), 1e-3) for part in (y_hat, y)]
+    return np.mean(1 - np.sum(y_hat * y, 1) / lengths[0] / lengths[1])
+
+
+def uncertainty(y_hat, y, s_t, s_r):
+    t, r = slice(None, 3), slice(3, None)
+    weighted = l1(y_hat[:, t], y[:, t]) * np.exp(-s_t) + l1(y_hat[:, r], y[:, r]) * np.exp(-s_r)
+    return weighted + s_t + s_r
+
+
+@table("experiment, name, definition", {f"{experiment}: {name}": (experiment, name, definition)
+                                        for experiment, name, definition in [
+    ("loss", "eq. 2", l1),
+    ("loss", "eq. 2 + eq. 5", lambda y_hat, y: l1(y_hat, y) + eq_5(y_hat, y)),
+    ("loss", "eq. 2 + 0.1 eq. 5", lambda y_hat, y: l1(y_hat, y) + 0.1 * eq_5(y_hat, y)),
+    ("loss", "eq. 2 + eq. 5 of the translation",
+     lambda y_hat, y: l1(y_hat, y) + eq_5(y_hat[:, :3], y[:, :3])),
+    ("loss", "uncertainty weighting", uncertainty),
+    ("output", "quaternion", l1),
+    ("output", "quaternion, uncertainty weighting", uncertainty)]})
+@given(seed=SEED, speed=st.sampled_from([0, 1]), prediction=st.sampled_from([-1, 0, 1e-4, 1]),
+       noise=st.sampled_from([0, 1]))
+def test_every_loss_follows_its_definition_and_has_finite_gradients(
+        experiment, name, definition, seed, speed, prediction, noise):
+    rng, variant = generator(seed), experiments.EXPERIMENTS[experiment][name]
+    y = variant.network.encode(motion(rng, speed, n=5))  # standing still, or moving
+    y_hat = prediction * y + noise * rng.normal(size=y.shape)  # also opposite, equal
+    objective = variant.objective().double()
+    learned = [float(x) for w in objective.parameters() for x in w.data.normal_()]
+    of_y_hat = torch.from_numpy(y_hat).requires_grad_()
+    loss = objective(of_y_hat, torch.from_numpy(y))
+    if variant.network is experiments.Quaternion:  # q and -q are the same rotation
+        other = y * [1, 1, 1, -1, -1, -1, -1]
+        y = np.stack([min(a, b, key=lambda t: np.linalg.norm(t - p))
+                      for a, b, p in zip(y, other, y_hat)])
+    assert_allclose(loss.item(), definition(y_hat, y, *learned), rtol=1e-9, atol=1e-9)
+    gradients = torch.autograd.grad(loss, [of_y_hat, *objective.parameters()])
+    assert all(gradient.isfinite().all() for gradient in gradients)
+
+
+@given(SEED)
+def test_quaternions_survive_the_round_trip_and_minus_q_is_the_same_rotation(seed):
+    T, network = motion(generator(seed), (2, 1, 1, 60, 30, 60), n=4), experiments.Quaternion
+    y = network.encode(T)
+    assert_allclose(np.linalg.norm(y[:, 3:], axis=1), 1, atol=1e-12)
+    for same in (y, y * ([1] * 3 + [-1] * 4)):
+        assert_allclose(network.decode(same), T, atol=1e-9)
+
+
+@given(SEED)
+def test_a_predicted_quaternion_has_length_one_and_its_sign_does_not_matter_to_the_loss(seed):
+    rng = generator(seed)
+    net, (batch, T) = a_net(rng, SMALL, experiments.Quaternion), a_batch(rng)
+    y_hat, y = net(batch), torch.from_numpy(net.encode(T)).float()
+    torch.testing.assert_close(y_hat[:, 3:].norm(dim=1), torch.ones(len(y)))
+    loss = experiments.QuaternionLoss(d3dlo.UnweightedLoss())
+    minus = torch.tensor([1.0, 1, 1, -1, -1, -1, -1])
+    torch.testing.assert_close(loss(y_hat * minus, y), loss(y_hat, y))
+    torch.testing.assert_close(loss(y_hat, y * minus), loss(y_hat, y))
+
+
+@pytest.mark.parametrize("experiment", experiments.EXPERIMENTS)
+def test_the_runs_of_a_table_differ_and_have_the_same_number_of_pair_steps(experiment):
+    variants = experiments.EXPERIMENTS[experiment]
+    pairs, budget, facts = 100, 1500, []
+    for variant in variants.values():
+        config = experiments.config_of(variant.changes, pairs, budget)
+        assert Config(**config.as_dict()) == config
+        per_batch = config.batch * (1 + (config.swap == "both"))
+        steps = config.epochs * pairs * (1 + (config.swap == "both"))
+        facts.append((steps, per_batch))
+    assert len(variants) > 1 and len(set(facts)) == 1 and abs(facts[0][0] - budget) <= pairs
+    rows = experiments.plan([experiment], pairs, budget, [0, 1], Path("out"), "data")[experiment]
+    assert len({run.folder for runs in rows.values() for run in runs}) == 2 * len(variants)
+
+
+def test_table_2_has_every_combination_of_neighbours_and_plane():
+    rows = [Config(**variant.changes) for variant in experiments.EXPERIMENTS["table2"].values()]
+    combinations = {(config.sa1.n_n, config.plane) for config in rows}
+    assert combinations == {(n, plane) for n in (8, 16, 32, 64, 128) for plane in (True, False)}
+
+
+def test_tables_share_their_runs_and_other_data_or_budgets_make_new_ones(tmp_path):
+    def folders(budget=1500, data="data"):
+        plan = experiments.plan(experiments.EXPERIMENTS, 100, budget, [0], tmp_path, data)
+        return {experiment: [run.folder for runs in rows.values() for run in runs]
+                for experiment, rows in plan.items()}
+    runs = folders()
+    assert runs == folders()
+    of_table_3 = runs.pop("table3")
+    assert len({folders[0] for folders in runs.values()}) == 1  # Table 1 with eq. 2
+    assert of_table_3[0] == runs["table2"][0] and set(of_table_3) < set(runs["table2"])
+    for other in (folders(budget=3000), folders(data="other")):
+        assert not set(sum(runs.values(), [])) & set(sum(other.values(), []))
+
+
+IDENTITY = b"1 0 0 0 0 1 0 0 0 0 1 0\n"
+
+
+@table("change", {  # what is done to the data
+    "a scan is longer": rewrite(SCAN, lambda data: data + data[:16]),
+    "a scan is written again": lambda root: os.utime(root / SCAN, (1, 1)),
+    "a pose is added and one removed":
+        rewrite(POSES, lambda data: data.partition(b"\n")[2] + IDENTITY),
+    "another calibration":
+        rewrite(CALIB, lambda data: data.partition(b"Tr:")[0] + b"Tr: " + IDENTITY)})
+def test_the_fingerprint_changes_with_the_data_and_not_with_the_place(tmp_path, change):
+    def fingerprint(root):
+        return experiments.fingerprint(*kitti.open_sequences(root))
+    root = write_root(tmp_path / "root")
+    copied = shutil.copytree(root, tmp_path / "copy")
+    assert fingerprint(copied) == fingerprint(root)
+    change(copied)
+    assert fingerprint(copied) != fingerprint(root)
+
+
+@table("network, config", REJECTED)
+def test_a_rejected_network_is_trained_stored_loaded_resumed_and_evaluated(here, network, config):
+    write_root(here / "root")
+    objective = experiments.UncertaintyLoss()
+    if network is experiments.Quaternion:
+        objective = experiments.QuaternionLoss(objective)
+    d3dlo.train(replace(config, epochs=2, batch=3), "root", out="run", network=network,
+                objective=objective)
+    net, state = load_weights("run", network)
+    assert type(net) is network and net.config.sa1.n_n == config.sa1.n_n
+    for name, tensor in net.state_dict().items():
+        assert torch.equal(tensor, state["model"][name])
+    with pytest.raises(ValueError, match="run/weights.pt"):
+        load_weights("run")  # another network
+    stored = torch.load("run/checkpoint.pt", weights_only=True)["objective"]
+    assert len(stored) == 1 and all(w.abs().min() > 0 for w in stored.values())  # it started at 0
+    for w in objective.parameters():
+        w.data.zero_()
+    d3dlo.train(out="run", resume=True, network=network, objective=objective)
+    for name, tensor in objective.state_dict().items():
+        assert torch.equal(tensor, stored[name])
+    assert torch.equal(net.mlp[-1].weight, load_weights("run", network)[0].mlp[-1].weight)
+    d3dlo.evaluate("root", "run", out="results", network=network)
+    results = json.loads((here / "results" / "results.json").read_text())
+    assert results["sequences"]["00"]["trained_on"] and results["pooled"]["t_step_m"] > 0
+
+
+# ------------------------------------------------------------------------------------------------------------- the readme
 
 def test_the_readme_s_python_runs_and_its_commands_parse(here, monkeypatch):
     def parse_only(parser, arguments=None, parse=argparse.ArgumentParser.parse_args):

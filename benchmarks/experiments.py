@@ -1,229 +1,527 @@
 """The paper's experiments, from data to a table: our figures beside the paper's.
 
-    python benchmarks/experiments.py table2 --dry-run               # the runs, and the time they will take
-    python benchmarks/experiments.py grouping coordinates           # 10,000 pair-steps a run, two seeds, simulated city
+    python benchmarks/experiments.py table2 --dry-run      # list the runs and estimate their time
+    python benchmarks/experiments.py loss coordinates      # simulated city, 10,000 pair-steps a run
     python benchmarks/experiments.py table2 table3 --data ROOT --budget 8000000 --seeds 0 1 2
 
-A pair-step is one pair of scans in one direction. All runs of a table have the same number of them in batches of the same size, the same
-data and, seed by seed, the same order of pairs; the recipe is the short one (d3dlo.SHORT). Runs lie in OUT, one folder each, named by what they
-depend on: one that is finished is never repeated, one that was interrupted goes on, and tables share them. Each run has one core to itself.
+The first half holds what the paper tried and rejected, as losses and as subclasses of D3DLO. Each
+uses one of two hooks of d3dlo.py: the objective of `fit`, and the class of the network.
+
+A pair-step is one pair of scans in one direction. All runs of a table have the same number of
+pair-steps, the same batch size, the same data and, seed by seed, the same order of pairs. The
+recipe is the short one, d3dlo.SHORT.
+
+Every run has a folder in OUT, named by a hash of everything it depends on. A finished run is never
+repeated, an interrupted one is resumed, and tables share runs. Each run uses one core.
 """
 import argparse
 import hashlib
 import json
 import math
 import os
+import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
+import torch.nn.functional as F
+from scipy.spatial.transform import Rotation
+from torch import nn
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import d3dlo
 import kitti
 import metrics
-from d3dlo import SHORT, Config, Layer
+from d3dlo import D3DLO, SHORT, Config, FlowEmbedding, MiniPointNet, UnweightedLoss
+
+# ------------------------------------------------------------------------------------------------
+# Losses: section 3.4, and section 3.2 on uncertainty
+
+
+class CosineLoss(nn.Module):
+    """Eq. 2 + weight * eq. 5 of the first n outputs. The first three are the translation."""
+
+    def __init__(self, weight, n=6):
+        super().__init__()
+        self.weight, self.n = weight, n
+
+    def extra_repr(self):
+        return f"weight={self.weight}, n={self.n}"
+
+    def forward(self, y_hat, y):
+        """(B,6), (B,6) -> ()."""
+        # Eq. 5 is not defined for a motion of zero. `eps` replaces lengths below a millimetre.
+        cosine = F.cosine_similarity(y_hat[:, :self.n], y[:, :self.n], eps=1e-3)  # (B,)
+        return (y - y_hat).abs().mean() + self.weight * (1 - cosine).mean()
+
+
+class UncertaintyLoss(nn.Module):
+    """Homoscedastic uncertainty weighting (Kendall and Cipolla 2017), with learned s = log sigma^2:
+    exp(-s_t) L_t + s_t + exp(-s_r) L_r + s_r for the errors L of translation and rotation.
+    """
+
+    def __init__(self):
+        super().__init__()
+        self.log_variance = nn.Parameter(torch.zeros(2))  # s_t, s_r
+
+    def forward(self, y_hat, y):
+        """(B,D), (B,D) -> (). The first three outputs are the translation."""
+        error = (y - y_hat).abs()
+        errors = torch.stack([error[:, :3].mean(), error[:, 3:].mean()])
+        return (torch.exp(-self.log_variance) * errors + self.log_variance).sum()
+
+
+class QuaternionLoss(nn.Module):
+    """A loss for quaternions. q and -q are the same rotation, so the target is the nearer one."""
+
+    def __init__(self, loss):
+        super().__init__()
+        self.loss = loss
+
+    def forward(self, y_hat, y):
+        """(B,7), (B,7) -> ()."""
+        t, q = y[:, :3], y[:, 3:]
+        opposite = (y_hat[:, 3:] * q).sum(1, keepdim=True) < 0  # (B,1)
+        return self.loss(y_hat, torch.cat([t, torch.where(opposite, -q, q)], 1))
+
+
+# ------------------------------------------------------------------------------------------------
+# Networks
+
+
+class Quaternion(D3DLO):
+    """Section 3.2: the rotation as a unit quaternion x, y, z, w. 61,355 parameters."""
+
+    @staticmethod
+    def encode(T):
+        """Poses (...,4,4) -> metres and quaternions (...,7)."""
+        return np.concatenate([T[..., :3, 3], Rotation.from_matrix(T[..., :3, :3]).as_quat()], -1)
+
+    @staticmethod
+    def decode(y):
+        """The inverse of `encode`."""
+        T = np.tile(np.eye(4), (*y.shape[:-1], 1, 1))
+        T[..., :3, 3] = y[..., :3]
+        T[..., :3, :3] = Rotation.from_quat(y[..., 3:]).as_matrix()
+        return T
+
+    def __init__(self, config=Config()):
+        super().__init__(config)
+        self.mlp[-1] = nn.Linear(self.mlp[-1].in_features, 7)
+
+    def forward(self, batch):
+        """Batch -> y_hat (B,7)."""
+        y_hat = super().forward(batch)
+        return torch.cat([y_hat[:, :3], F.normalize(y_hat[:, 3:])], 1)
+
+
+class TwoBalls(nn.Module):
+    """Multi-scale grouping, section 3.3.2: a MiniPointNet for a ball, and one for half its radius.
+
+    On a surface half the radius holds a quarter of the points, so the small ball gets a quarter of
+    the neighbours. They come nearest first: the small ball is the beginning of the large one.
+    """
+
+    def __init__(self, c, layer):
+        super().__init__()
+        self.r, self.n_n = layer.r / 2, max(1, layer.n_n // 4)  # of the small ball
+        self.small = MiniPointNet(c, layer.mlp)
+        self.large = MiniPointNet(c, layer.mlp)
+
+    def forward(self, f):
+        """Features of neighbours (C,S,k,c), the last three x_i - x'_j -> (C,S,2c')."""
+        small = f[:, :, :self.n_n]
+        inside = small[..., -3:].norm(dim=-1, keepdim=True) <= self.r  # (C,S,n_n,1)
+        small = torch.where(inside, small, f[:, :, :1])  # missing ones are the centroid
+        return torch.cat([self.small(small), self.large(f)], -1)
+
+
+class TwoScales(D3DLO):
+    """Multi-scale grouping in the first set abstraction. 64,206 parameters."""
+
+    def __init__(self, config=Config()):
+        super().__init__(config)
+        self.sa1.mpn = TwoBalls(1 + 3, config.sa1)  # intensity and x_i - x'_j
+        self.fe = FlowEmbedding(2 * config.sa1.mlp[-1], config.fe)
+
+
+class AppendCoordinates(nn.Module):
+    """A set abstraction, and the coordinates of its centroids appended to their features."""
+
+    def __init__(self, sa):
+        super().__init__()
+        self.sa = sa
+
+    def forward(self, x, f, idx):
+        """x (B,n,3), f (B,n,c), idx (B,S,k) -> (B,S,c'+3), the coordinates in tens of metres."""
+        f = self.sa(x, f, idx)
+        return torch.cat([f, x[:, :f.shape[1]] / 10], -1)
+
+
+class Coordinates(D3DLO):
+    """Not in the paper but in DeepCLR: the mini-PointNet sees where its 64 points are.
+
+    61,482 parameters.
+    """
+
+    def __init__(self, config=Config()):
+        super().__init__(config)
+        self.sa3 = AppendCoordinates(self.sa3)
+        self.mpn = MiniPointNet(config.sa3.mlp[-1] + 3, config.mpn.mlp)
+
+
+# ------------------------------------------------------------------------------------------------
+# Experiments
+
+
+class Variant(NamedTuple):
+    """A row of a table, or several where it is measured on several splits."""
+
+    paper: str | dict = ""  # the paper's words, or {split: its E_t [%] and E_r [deg/m]}
+    changes: dict = {}  # what differs from Config(**SHORT)
+    network: type = D3DLO
+    objective: Callable[[], nn.Module] = UnweightedLoss
+
 
 T1 = Config()
-QUATERNION = T1.mlp._replace(mlp=(64, 7))
-PAPER_2 = {(8, True): (2.19, 0.00855), (16, True): (2.5, 0.01015), (32, True): (2.53, 0.00937), (64, True): (3.63, 0.01483),
-           (128, True): (3.04, 0.01172), (8, False): (2.29, 0.00946), (16, False): (2.76, 0.01115), (32, False): (2.28, 0.00969),
-           (64, False): (2.52, 0.01057), (128, False): (2.82, 0.01192)}
-PAPER_3 = {(8, True): ((3.49, 0.01393), (2.5, 0.01646)), (8, False): ((3.98, 0.01571), (3.89, 0.02563)), (32, False): ((4.32, 0.01642), (4.07, 0.03089))}
+RANDOM = dict(swap="random", batch=2 * SHORT["batch"])  # a batch has as many pair-steps as "both"
+TWO_SCALES = dict(sa1=T1.sa1._replace(r=2.0, n_n=4 * T1.sa1.n_n))  # 1 m, 8; 2 m, 32
+PAPER_2 = {  # n_n and plane -> E_t, E_r
+    (8, True): (2.19, 0.00855), (16, True): (2.5, 0.01015), (32, True): (2.53, 0.00937),
+    (64, True): (3.63, 0.01483), (128, True): (3.04, 0.01172),
+    (8, False): (2.29, 0.00946), (16, False): (2.76, 0.01115), (32, False): (2.28, 0.00969),
+    (64, False): (2.52, 0.01057), (128, False): (2.82, 0.01192)}
+PAPER_3 = {  # n_n and plane -> E_t, E_r of the test split; of the validation split
+    (8, True): ((3.49, 0.01393), (2.5, 0.01646)),
+    (8, False): ((3.98, 0.01571), (3.89, 0.02563)),
+    (32, False): ((4.32, 0.01642), (4.07, 0.03089))}
+SPLITS = {"table2": ("all",), "table3": ("test", "validation")}  # all others: test
 
 
-def _table_2(n_n, plane):
-    return dict(sa1=T1.sa1._replace(n_n=n_n), plane=plane)
+def row_of_table_2(n_n, plane, paper):
+    """The name and the Variant of a combination of n_n and plane."""
+    name = f"n_n = {n_n}, {'with' if plane else 'without'} plane"
+    return name, Variant(paper, dict(sa1=T1.sa1._replace(n_n=n_n), plane=plane))
 
 
-def _name_2(n_n, plane):
-    return f"n_n = {n_n}, {'with' if plane else 'without'} plane"
-
-
-# experiment -> variant -> (what differs from the default Config, {split: the paper's E_t [%] and E_r [deg/m]} or its words)
 EXPERIMENTS = {
-    "grouping": {"nearest n_n": ({}, "open"), "spread over the nearest 8 n_n": (dict(spread=8), "open")},
-    "coordinates": {"Table 1": ({}, ""), "coordinates into the mini-PointNet": (dict(coordinates=True), "DeepCLR's")},
-    "table2": {_name_2(*key): (_table_2(*key), {"all": paper}) for key, paper in PAPER_2.items()},
-    "table3": {_name_2(*key): (_table_2(*key), dict(zip(("test", "validation"), paper))) for key, paper in PAPER_3.items()},
-    "loss": {"eq. 2": ({}, "best"), "eq. 2 + eq. 5": (dict(cosine=1.0), "no gain"), "eq. 2 + 0.1 eq. 5": (dict(cosine=0.1), "no gain"),
-             "eq. 2 + eq. 5 of the translation": (dict(cosine=1.0, cosine_of="translation"), "no gain"),
-             "uncertainty weighting": (dict(uncertainty=True), "no gain")},
-    "output": {"Euler angles": ({}, "best"), "quaternion": (dict(mlp=QUATERNION), "no gain"),
-               "quaternion, uncertainty weighting": (dict(mlp=QUATERNION, uncertainty=True), "")},
-    "scales": {"one scale": ({}, "best"), "two scales in SA1: 1 m and 2 m": (dict(scales=(Layer(2.0, None, 8, (4, 8, 16, 32)),)), "no gain")},
-    "swap": {"both directions": ({}, ""), "the paper's coin": (dict(swap="random", batch=2 * SHORT["batch"]), "used"),
-             "forward only": (dict(swap="off", batch=2 * SHORT["batch"]), "")},
+    "table2": dict(row_of_table_2(*key, {"all": paper}) for key, paper in PAPER_2.items()),
+    "table3": dict(row_of_table_2(*key, dict(zip(SPLITS["table3"], paper)))
+                   for key, paper in PAPER_3.items()),
+    "loss": {
+        "eq. 2": Variant("best"),
+        "eq. 2 + eq. 5": Variant("no gain", objective=lambda: CosineLoss(1.0)),
+        "eq. 2 + 0.1 eq. 5": Variant("no gain", objective=lambda: CosineLoss(0.1)),
+        "eq. 2 + eq. 5 of the translation":
+            Variant("no gain", objective=lambda: CosineLoss(1.0, n=3)),
+        "uncertainty weighting": Variant("no gain", objective=UncertaintyLoss)},
+    "output": {
+        "Euler angles": Variant("best"),
+        "quaternion": Variant("no gain", {}, Quaternion, lambda: QuaternionLoss(UnweightedLoss())),
+        "quaternion, uncertainty weighting":
+            Variant("", {}, Quaternion, lambda: QuaternionLoss(UncertaintyLoss()))},
+    "scales": {
+        "one scale": Variant("best"),
+        "two scales in SA1: 1 m and 2 m": Variant("no gain", TWO_SCALES, TwoScales)},
+    "coordinates": {
+        "Table 1": Variant(),
+        "coordinates into the mini-PointNet": Variant("DeepCLR's", network=Coordinates)},
+    "swap": {
+        "both directions": Variant(),
+        "one direction at random": Variant("used", RANDOM)},
 }
 
 
-def splits_of(name):
-    """What an experiment is measured on."""
-    return {"table2": ("all",), "table3": ("test", "validation")}.get(name, ("test",))
+def splits_of(experiment):
+    """The splits an experiment is measured on."""
+    return SPLITS.get(experiment, ("test",))
+
+
+# ------------------------------------------------------------------------------------------------
+# Runs
+
+
+class Run(NamedTuple):
+    """One training run and its evaluation."""
+
+    experiment: str
+    variant: str  # EXPERIMENTS[experiment][variant]
+    config: Config
+    seed: int
+    folder: Path
+
+    def finished(self):
+        """Whether its results are there."""
+        return (self.folder / "all" / "results.json").exists()
 
 
 def pair_steps(config, pairs):
-    """Of a whole training."""
+    """Number of pair-steps of a whole training run."""
     return config.epochs * pairs * (2 if config.swap == "both" else 1)
 
 
 def config_of(changes, pairs, budget):
-    """The short recipe, as many epochs as the budget holds, and at least one over both directions."""
+    """The short recipe with changes. The number of epochs follows from the budget; at least one
+    epoch over both directions.
+    """
     config = replace(Config(**SHORT), **changes)
-    return replace(config, epochs=max(1, round(budget / (2 * pairs))) * (1 if config.swap == "both" else 2))
+    epochs = max(1, round(budget / (2 * pairs)))
+    return replace(config, epochs=epochs if config.swap == "both" else 2 * epochs)
 
 
-def folder_of(out, config, seed, chosen, everything):
-    """Where a run lies: named by all it depends on, the data included."""
-    depends = config.as_dict(), seed, d3dlo.GEOMETRY, [s.name for s in chosen], [d3dlo.fingerprint(s) for s in everything]
-    return out / hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()[:12]
+def fingerprint(sequence):
+    """A hash that changes with the data of a sequence. The scans are not read, since they are big:
+    their sizes and modification times stand for them.
+    """
+    stats = [path.stat() for path in sequence.scan_paths]
+    scans = np.array([(s.st_size, s.st_mtime_ns) for s in stats])
+    content = scans.tobytes() + sequence.Tr.tobytes() + sequence.poses_cam.tobytes()
+    return hashlib.sha256(content).hexdigest()
 
 
-def seconds_a_step(config):
-    """One core's time for a pair-step, timed on random points."""
+def plan(experiments, pairs, budget, seeds, out, data):
+    """{experiment: {variant: [a Run for each seed]}}. data: what identifies the data, for JSON."""
+    def run(experiment, name, seed):
+        variant = EXPERIMENTS[experiment][name]
+        config = config_of(variant.changes, pairs, budget)
+        depends = (config.as_dict(), variant.network.__name__, repr(variant.objective()), seed,
+                   d3dlo.GEOMETRY, data)
+        key = hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()[:12]
+        return Run(experiment, name, config, seed, out / key)
+
+    return {experiment: {name: [run(experiment, name, seed) for seed in seeds]
+                         for name in EXPERIMENTS[experiment]} for experiment in experiments}
+
+
+def seconds_a_step(variant, config):
+    """Time of one core for a pair-step, measured on random points."""
     torch.set_num_threads(1)
-    rng, records = np.random.default_rng(0), np.zeros(config.batch + 1, d3dlo.geometry_dtype(config))
+    rng = np.random.default_rng(0)
+    records = np.zeros(config.batch + 1, d3dlo.geometry_dtype(config))
     records["xyz"] = rng.normal(size=records["xyz"].shape) * 20
     records["group"] = rng.normal(size=records["group"].shape)
-    for name, layer in ("idx2", config.sa1), ("idx3", config.sa2):
-        records[name] = rng.integers(layer.n_fps, size=records[name].shape)
-    motions = [np.tile(np.eye(4), (config.batch, 1, 1))]
-    net, objective, times = d3dlo.D3DLO(config), d3dlo.Objective(config), []
+    records["idx2"] = rng.integers(config.sa1.n_fps, size=records["idx2"].shape)
+    records["idx3"] = rng.integers(config.sa2.n_fps, size=records["idx3"].shape)
+    motions = np.tile(np.eye(4), (config.batch, 1, 1))
+    pairs = [(0, i) for i in range(config.batch)]
+    training = d3dlo.Training(variant.network(config), [records], [motions], "",
+                              objective=variant.objective())
+    times = []
     for _ in range(2):
         start = time.perf_counter()
-        batch, target = d3dlo.training_batch([records], motions, [(0, i) for i in range(config.batch)], config, rng)
-        objective(net(batch), target).backward()
+        batch, T = d3dlo.training_batch([records], [motions], pairs, config, rng)
+        training.advance(batch, T)
         times.append(time.perf_counter() - start)
-    return min(times) / len(target)
+    return min(times) / len(T)
 
 
-def run_one(run, config, root, sequences, evaluated, seed):
-    """One training and its evaluation, in a process of its own with one thread."""
-    job = json.dumps(dict(run=str(run), config=config.as_dict(), root=str(root), sequences=sequences, evaluated=evaluated, seed=seed))
-    run.mkdir(parents=True, exist_ok=True)
-    with open(run / "output.txt", "a") as log:
-        done = subprocess.run([sys.executable, __file__, "--child", job], stdout=log, stderr=subprocess.STDOUT,
-                              env=os.environ | {"OMP_NUM_THREADS": "1"})
-    if done.returncode:
-        raise RuntimeError(f"{run}: failed, see {run}/output.txt")
+CHILDREN = set()  # the processes of training runs under way
 
 
-def child(run, config, root, sequences, evaluated, seed):
-    """What `run_one` runs: train, or go on, and evaluate."""
+def run_one(run, root, sequences, evaluated):
+    """Train and evaluate in a process of its own. RuntimeError when that fails."""
+    job = dict(experiment=run.experiment, variant=run.variant, config=run.config.as_dict(),
+               seed=run.seed, folder=str(run.folder), root=str(root), sequences=sequences,
+               evaluated=evaluated)
+    run.folder.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, __file__, "--child", json.dumps(job)]
+    one_thread = os.environ | {"OMP_NUM_THREADS": "1"}
+    with open(run.folder / "output.txt", "a", encoding="utf-8") as log:
+        child = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=one_thread)
+    CHILDREN.add(child)
+    code = child.wait()
+    CHILDREN.remove(child)
+    if code:
+        raise RuntimeError(f"{run.folder}: failed, see {run.folder}/output.txt")
+
+
+def run_child(experiment, variant, config, seed, folder, root, sequences, evaluated):
+    """What `run_one` runs: start or resume the training run, then evaluate."""
     torch.set_num_threads(1)
-    d3dlo.keep_freed_memory()
-    d3dlo.train(Config(**config), root, sequences, run, seed=seed, resume=(Path(run) / "config.json").exists())
-    d3dlo.evaluate(root, run, evaluated, out=Path(run) / "all")
+    kitti.keep_freed_memory()
+    kitti.terminate_as_interrupted()
+    variant, folder = EXPERIMENTS[experiment][variant], Path(folder)
+    d3dlo.train(Config(**config), root, sequences, folder, seed, network=variant.network,
+                objective=variant.objective(), resume=(folder / "config.json").exists())
+    d3dlo.evaluate(root, folder, evaluated, folder / "all", network=variant.network)
 
 
-def figures(run, split):
-    """E_t, E_r, t step, r step of a run on a split."""
-    results = json.loads((run / "all" / "results.json").read_text())
-    result = (results["splits"] | {"all": results["pooled"]})[split]
-    return [result[key] if result[key] is not None else math.nan for key in ("E_t", "E_r", "t_step_m", "r_step_deg")]
+def stop_children(number, frame):
+    """Handle SIGTERM. Ctrl-C in a terminal reaches the children too; SIGTERM must be passed on."""
+    for child in list(CHILDREN):
+        child.terminate()
+    raise KeyboardInterrupt
 
 
-def table(name, variants, runs, out, caption):
-    """The Markdown table of an experiment; mean over the seeds, and their range when there are several."""
-    header = ["", "split", "parameters", "paper's E_t [%]", "paper's E_r [deg/m]", "E_t [%]", "E_r [deg/m]", "t step [m]", "r step [deg]"]
-    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
-    for variant, (_, paper) in variants.items():
-        config = runs[variant][0][0]
-        parameters = sum(p.numel() for p in d3dlo.D3DLO(config).parameters())
-        for split in splits_of(name):
-            seeds = np.array([figures(run, split) for _, run, _ in runs[variant]])     # (seeds,4)
-            cells = ["-" if np.isnan(c).any() else f"{c.mean():.{digits}f}" + (f" ({c.min():.{digits}f} to {c.max():.{digits}f})" if len(c) > 1 else "")
-                     for c, digits in zip(seeds.T, (3, 5, 4, 4))]
-            theirs = [f"{paper[split][0]}", f"{paper[split][1]:.5f}"] if isinstance(paper, dict) else [paper, ""]
-            lines.append("| " + " | ".join([variant, split, f"{parameters:,}", *theirs, *cells]) + " |")
-    text = f"# {name}\n\n" + "\n".join(lines) + f"\n\n{caption}\n"
-    with metrics.replacing(out / f"{name}.md") as temporary:
-        temporary.write_text(text, encoding="utf-8")
-    print(f"\n{text}\n{out}/{name}.md")
-
-
-def dry_run(runs, todo, steps, jobs):
-    """Say which runs of `todo` each experiment needs, and how long they take; what two of them share is counted once."""
-    cost, left, total = {}, dict(todo), 0
-    for name, variants in runs.items():
-        for variant, some in variants.items():
-            for config, run, seed in some:
-                if left.pop(run, None):
-                    cost[config] = cost.get(config) or seconds_a_step(config)
-                    total += cost[config] * steps
-                    print(f"{name}: {variant}, seed {seed}: {cost[config] * steps / 60:.0f} minutes of one core -> {run}", flush=True)
-    print(f"{total / 3600 / jobs:.1f} hours with {jobs} at a time, and the caches")
-
-
-def train_all(todo, root, sequences, evaluated, jobs):
-    """`jobs` runs at a time, each in its own process."""
+def run_all(todo, root, sequences, evaluated, jobs):
+    """Execute a list of Runs, `jobs` at a time."""
     pool = ThreadPoolExecutor(jobs)
     try:
-        runs = [pool.submit(run_one, run, config, root, sequences, evaluated, seed) for run, (config, seed) in todo.items()]
-        for run in kitti.progress(runs, len(runs), "trainings"):
-            run.result()
-    finally:                                            # an interruption, or a run that failed: start no other
+        futures = [pool.submit(run_one, run, root, sequences, evaluated) for run in todo]
+        for future in kitti.progress(futures, len(futures), "training runs"):
+            future.result()
+    finally:  # after an interruption or a failure start no further run
         pool.shutdown(cancel_futures=True)
 
 
+def dry_run(todo, steps, scans, jobs):
+    """Print the Runs of a list, how long they will take and how large the caches are."""
+    seconds, total = {}, 0  # of a variant; of all runs
+    for run in todo:
+        key = run.experiment, run.variant
+        if key not in seconds:
+            variant = EXPERIMENTS[run.experiment][run.variant]
+            seconds[key] = steps * seconds_a_step(variant, run.config)
+        total += seconds[key]
+        print(f"{run.experiment}: {run.variant}, seed {run.seed}: {seconds[key] / 60:.0f} minutes "
+              f"of one core -> {run.folder}", flush=True)
+    caches = {(c.sa1, c.sa2, c.sa3, c.plane): d3dlo.geometry_dtype(c).itemsize
+              for c in (run.config for run in todo)}
+    print(f"{total / 3600 / jobs:.1f} hours with {jobs} at a time, and the time to make caches of "
+          f"{scans * sum(caches.values()) / 1e9:.1f} GB")
+
+
+# ------------------------------------------------------------------------------------------------
+# Tables
+
+HEADER = ["", "split", "parameters", "paper's E_t [%]", "paper's E_r [deg/m]",
+          "E_t [%]", "E_r [deg/m]", "t step [m]", "r step [deg]"]
+
+
+def figures(run, split):
+    """E_t, E_r, t step and r step of a Run on a split."""
+    results = json.loads((run.folder / "all" / "results.json").read_text(encoding="utf-8"))
+    result = results["pooled"] if split == "all" else results["splits"][split]
+    figures = [result[key] for key in ("E_t", "E_r", "t_step_m", "r_step_deg")]
+    return [math.nan if x is None else x for x in figures]
+
+
+def cell(values, digits):
+    """The mean over the seeds and, when there are several, their range."""
+    if np.isnan(values).any():
+        return "-"
+    mean, low, high = (f"{x:.{digits}f}" for x in (values.mean(), values.min(), values.max()))
+    return mean if len(values) == 1 else f"{mean} ({low} to {high})"
+
+
+def markdown(experiment, runs, words):
+    """The table of an experiment."""
+    lines = [HEADER, ["---"] * len(HEADER)]
+    for name, of_seeds in runs.items():
+        variant = EXPERIMENTS[experiment][name]
+        net = variant.network(of_seeds[0].config)
+        parameters = f"{sum(p.numel() for p in net.parameters()):,}"
+        for split in splits_of(experiment):
+            paper = [variant.paper, ""]
+            if isinstance(variant.paper, dict):
+                E_t, E_r = variant.paper[split]
+                paper = [f"{E_t}", f"{E_r:.5f}"]
+            columns = np.array([figures(run, split) for run in of_seeds]).T  # (4,seeds)
+            ours = [cell(values, digits) for values, digits in zip(columns, (3, 5, 4, 4))]
+            lines.append([name, split, parameters, *paper, *ours])
+    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    return f"# {experiment}\n\n{table}\n\n{words}\n"
+
+
+def write_table(experiment, runs, out, words):
+    """Write OUT/EXPERIMENT.md and print it."""
+    text, path = markdown(experiment, runs, words), out / f"{experiment}.md"
+    with metrics.replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    print(f"\n{text}\n{path}")
+
+
+# ------------------------------------------------------------------------------------------------
+# The command line
+
+
+def command_line():
+    """The arguments."""
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    add = parser.add_argument
+    add("experiments", nargs="+", choices=EXPERIMENTS, metavar="NAME", help=", ".join(EXPERIMENTS))
+    add("--data", metavar="ROOT",
+        help=f"folder in KITTI odometry layout (default: the simulated city, {d3dlo.SIMULATED})")
+    add("--sequences", nargs="+", default=["train"], metavar="NN",
+        help="names or splits to train on (default: train)")
+    add("--budget", type=int, default=10000, metavar="N",
+        help="pair-steps of a training run (default: 10,000; the paper's have some 8,000,000)")
+    add("--seeds", nargs="+", type=int, default=[0, 1], metavar="N", help="default: 0 1")
+    add("--jobs", type=int, default=kitti.cores(), metavar="N",
+        help="training runs at a time (default: one for each core)")
+    add("--out", type=Path, default=Path("runs/experiments"), metavar="DIR",
+        help="folder of the runs and tables (default: runs/experiments)")
+    add("--dry-run", action="store_true", help="list the runs and estimate their time")
+    return parser.parse_args()
+
+
+def caption(experiment, args, trained, pairs, steps):
+    """The line below a table: what was run, and the command that makes the table again."""
+    seeds = " ".join(map(str, args.seeds))
+    command = ["python benchmarks/experiments.py", experiment]
+    if args.data:
+        command += ["--data", args.data]
+    if args.sequences != ["train"]:
+        command += ["--sequences", *args.sequences]
+    command += ["--budget", f"{args.budget}", "--seeds", seeds]
+    return (f"{args.data or 'Simulated city'}: trained on sequences {' '.join(trained)} "
+            f"({pairs:,} pairs), {steps:,} pair-steps a run (the paper's have some 8 million), "
+            f"short recipe, seeds {seeds}; mean over the seeds, their range in brackets. "
+            f"Made by `{' '.join(command)}`.")
+
+
+def check_splits(root, experiments, names):
+    """ValueError when a split that an experiment is measured on has no sequence."""
+    for split in dict.fromkeys(split for name in experiments for split in splits_of(name)):
+        if split != "all" and not set(kitti.SPLITS[split]) & set(names):
+            raise ValueError(f"{root}: has none of the sequences of the {split} split, "
+                             f"{' '.join(kitti.SPLITS[split])}, on which the table is measured")
+
+
 def main():
-    """The command line."""
+    """The command line. ValueError, OSError, RuntimeError, KeyboardInterrupt."""
     if sys.argv[1:2] == ["--child"]:
-        child(**json.loads(sys.argv[2]))
-        return 0
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("experiments", nargs="+", choices=EXPERIMENTS, metavar="NAME", help=f"of {', '.join(EXPERIMENTS)}")
-    parser.add_argument("--data", metavar="ROOT", help=f"folder in KITTI odometry layout (default: the simulated city, {d3dlo.SIMULATED})")
-    parser.add_argument("--sequences", nargs="+", default=["train"], metavar="NN", help="to train on (default: train)")
-    parser.add_argument("--budget", type=int, default=10000, metavar="N", help="pair-steps of a training (default: 10,000; the paper's is some 8,000,000)")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1], metavar="N")
-    parser.add_argument("--jobs", type=int, default=kitti.cores(), metavar="N", help="trainings at a time (default: one for each core)")
-    parser.add_argument("--out", type=Path, default=Path("runs/experiments"), metavar="DIR")
-    parser.add_argument("--dry-run", action="store_true", help="list the runs and the time they will take")
-    args = parser.parse_args()
-    d3dlo.keep_freed_memory()
+        return run_child(**json.loads(sys.argv[2]))
+    args = command_line()
+    signal.signal(signal.SIGTERM, stop_children)
     root = Path(args.data) if args.data else kitti.simulate(d3dlo.SIMULATED)
-    everything = [s for s in kitti.open_sequences(root) if s.poses is not None]
-    chosen, names = kitti.open_sequences(root, args.sequences), [s.name for s in everything]
-    for split in {split for name in args.experiments for split in splits_of(name)} - {"all"}:
-        if not set(kitti.SPLITS[split]) & set(names):
-            parser.error(f"{root}: none of the sequences of the {split} split ({' '.join(kitti.SPLITS[split])}), on which the table is measured")
+    sequences = [s for s in kitti.open_sequences(root) if s.poses is not None]
+    chosen = kitti.open_sequences(root, args.sequences)
+    evaluated, trained = [s.name for s in sequences], [s.name for s in chosen]
+    check_splits(root, args.experiments, evaluated)
     pairs = sum(len(s.motions()) for s in chosen)
 
-    runs = {name: {variant: [(config, folder_of(args.out, config, seed, chosen, everything), seed) for seed in args.seeds
-                             for config in [config_of(changes, pairs, args.budget)]]
-                   for variant, (changes, _) in EXPERIMENTS[name].items()} for name in args.experiments}
-    every = {run: (config, seed) for variants in runs.values() for some in variants.values() for config, run, seed in some}
-    todo = {run: job for run, job in every.items() if not (run / "all" / "results.json").exists()}
-    steps = pair_steps(next(iter(every.values()))[0], pairs)
-    records = {(d3dlo.geometry_dtype(c), c.plane, c.spread) for c, _ in todo.values()}
-    print(f"{len(every)} runs, {len(every) - len(todo)} of them finished; {pairs:,} pairs of {root}, {steps:,} pair-steps a run; "
-          f"caches of {sum(dtype.itemsize for dtype, *_ in records) * sum(map(len, everything)) / 1e9:.1f} GB", flush=True)
+    data = trained, {s.name: fingerprint(s) for s in sequences}
+    runs = plan(args.experiments, pairs, args.budget, args.seeds, args.out, data)
+    unique = {}
+    for run in (run for rows in runs.values() for row in rows.values() for run in row):
+        unique.setdefault(run.folder, run)
+    todo = [run for run in unique.values() if not run.finished()]
+    steps = pair_steps(next(iter(unique.values())).config, pairs)
+    print(f"{len(unique)} runs, {len(unique) - len(todo)} of them finished; {pairs:,} pairs of "
+          f"{root}, {steps:,} pair-steps a run", flush=True)
     if args.dry_run:
-        dry_run(runs, todo, steps, args.jobs)
-        return 0
-    for config in dict.fromkeys(config for config, _ in todo.values()):     # caches first, with all cores
-        d3dlo.load_geometry(everything, config)
-    train_all(todo, root, [s.name for s in chosen], names, args.jobs)
-    repeat = [*(["--data", args.data] if args.data else []), *(["--sequences", *args.sequences] if args.sequences != ["train"] else []),
-              "--budget", str(args.budget), "--seeds", *map(str, args.seeds)]
-    for name, variants in runs.items():
-        table(name, EXPERIMENTS[name], variants, args.out, (
-            f"{'Simulated city' if not args.data else root}: trained on sequences {' '.join(s.name for s in chosen)} ({pairs:,} pairs), "
-            f"{steps:,} pair-steps a run (the paper's are some 8 million) by the short recipe, seeds {' '.join(map(str, args.seeds))}; "
-            f"mean over the seeds, their range in brackets. Made by `{' '.join(['python benchmarks/experiments.py', name, *repeat])}`."))
-    return 0
+        return dry_run(todo, steps, sum(map(len, sequences)), args.jobs)
+    for config in dict.fromkeys(run.config for run in todo):  # caches first, with all cores
+        d3dlo.load_geometry(sequences, config)
+    run_all(todo, root, trained, evaluated, args.jobs)
+    for experiment, rows in runs.items():
+        words = caption(experiment, args, trained, pairs, steps)
+        write_table(experiment, rows, args.out, words)
 
 
 if __name__ == "__main__":
     try:
-        sys.exit(main())
+        main()
     except (ValueError, OSError, RuntimeError) as error:
         sys.exit(f"experiments: {error}")
     except KeyboardInterrupt:
-        sys.exit("\nexperiments: interrupted; the same command goes on from here")
+        sys.exit("\nexperiments: interrupted; run the same command again to resume")
