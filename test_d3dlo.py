@@ -165,7 +165,7 @@ def test_the_radius_of_a_ball_is_inclusive(r):
     assert_array_equal(group_ball(np.array([[0, 0, 0], [r, 0, 0], [0, beyond, 0]]), np.array([0]), r, 3), [[0, 1, 0]])
 
 
-@given(SEED, KINDS, st.integers(1, 300), st.integers(1, 16))
+@given(SEED, KINDS, st.integers(1, 12) | st.integers(1, 300), st.integers(1, 16))
 def test_group_knn_equals_brute_force(seed, kind, N, k):
     rng = generator(seed)
     xyz, query = points(rng, kind, N), points(rng, kind, 20)
@@ -173,6 +173,19 @@ def test_group_knn_equals_brute_force(seed, kind, N, k):
         assert_allclose(d[row[:N]], np.sort(d)[:k], rtol=1e-12, atol=1e-12)
         assert len(set(row[:N])) == min(k, N) and len(row) == k
         assert_array_equal(row[N:], row[0])             # fewer than k points: the nearest once more
+
+
+@given(SEED, KINDS, st.integers(1, 60), st.integers(1, 70))
+def test_neighbours_by_a_matrix_are_those_of_the_tree(seed, kind, N, k):
+    rng = generator(seed)
+    clouds = [(points(rng, kind, N), points(rng, kind, 20)) for _ in range(2)]
+    xyz, query = (torch.from_numpy(np.stack(part)) for part in zip(*clouds))
+    for (y, x), rows in zip(clouds, d3dlo.knn_by_matrix(query, xyz, k), strict=True):
+        D = cdist(x.astype(float), y.astype(float))
+        expected, got = (np.take_along_axis(D, idx, 1) for idx in (group_knn(y, x, k), rows.numpy()))
+        assert_allclose(got, expected, atol=1e-4)
+        assert all(len(set(row.tolist())) == min(k, N) for row in rows)
+        assert (rows[:, N:] == rows[:, :1]).all() and rows.shape == (20, k)
 
 
 @given(SEED)
@@ -239,6 +252,43 @@ def count(module):
 def test_table_1_has_61290_parameters():
     blocks = {"sa1": 868, "fe": 4480, "sa2": 8768, "sa3": 8768, "mpn": 21440, "mlp": 16966}
     assert {name: count(block) for name, block in D3DLO().named_children()} == blocks and count(D3DLO()) == 61290
+
+
+def test_the_default_config_is_the_papers():
+    table_1 = {"sa1": Layer(1.0, 1024, 8, (4, 8, 16, 32)), "fe": Layer(None, None, 16, (32, 64)),
+               "sa2": Layer(4.0, 256, 32, (64, 64)), "sa3": Layer(8.0, 64, 8, (64, 64)),
+               "mpn": Layer(None, None, None, (64, 256)), "mlp": Layer(None, None, None, (64, 6))}
+    section_4 = dict(epochs=500, optimizer="adam", schedule="steps", swap="random", max_range=None,
+                     plane=True, augment=False, frozen=0)
+    default = vars(Config())
+    assert table_1.items() | section_4.items() <= default.items()
+    assert default.keys() - (table_1 | section_4).keys() == {"batch", "lr"}  # the paper does not say
+    adam, = d3dlo.make_optimizers(D3DLO(), d3dlo.UnweightedLoss())
+    assert type(adam) is torch.optim.Adam
+    assert adam.defaults == torch.optim.Adam([torch.zeros(1)]).defaults  # "with default values"
+
+
+class OnlyOnMeta(torch.utils._python_dispatch.TorchDispatchMode):
+    """Fails for every operation that returns a tensor on another device."""
+
+    def __torch_dispatch__(self, function, types, arguments=(), options=None):
+        result = function(*arguments, **options or {})
+        for tensor in torch.utils._pytree.tree_leaves(result):
+            assert not isinstance(tensor, torch.Tensor) or tensor.is_meta, function
+        return result
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_the_network_makes_no_tensor_on_the_cpu(training):
+    geometry, motions = pairs_of_scans(generator(0), 3)
+    p, q = np.array([0, 2, 5]), np.array([1, 3, 4])
+    batch = d3dlo.make_batch(np.concatenate(geometry), p, q, SMALL, "meta")
+    net = d3dlo.for_device(D3DLO(SMALL), "meta").train(training)
+    assert type(net.sa1) is d3dlo.SetAbstraction and all(part.is_meta for part in batch)
+    with OnlyOnMeta():
+        y_hat = net(batch)
+        d3dlo.UnweightedLoss()(y_hat, torch.empty_like(y_hat)).backward()
+    assert y_hat.shape == (3, 6) and net.sa1.mpn.h[0].weight.grad.is_meta
 
 
 CONFIGS = {
@@ -688,13 +738,33 @@ def test_weights_rebuild_their_network_from_the_file_itself(tmp_path, config):
         assert_array_equal(predict(loaded, p, q), predict(net, p, q))
 
 
-def test_the_weights_shipped_follow_a_drive_they_have_not_seen(tmp_path):
-    s, = kitti.open_sequences(kitti.simulate(tmp_path, seed=1, sequences=["06"], scans=8, workers=1))
-    net, _ = load_weights()
-    poses = d3dlo.accumulate(d3dlo.predict_motions(net, np.stack([scan_geometry(s.scan(i), net.config) for i in range(8)]), refine=1))
+@pytest.fixture(scope="session")
+def new_drive(tmp_path_factory):
+    """A simulated sequence that the shipped weights have not seen, and its geometry for them."""
+    root = tmp_path_factory.mktemp("new")
+    s, = kitti.open_sequences(kitti.simulate(root, seed=1, sequences=["06"], scans=8, workers=1))
+    config = load_weights()[0].config
+    return s, np.stack([scan_geometry(s.scan(i), config) for i in range(8)])
+
+
+def test_the_weights_shipped_follow_a_drive_they_have_not_seen(new_drive):
+    (s, records), (net, _) = new_drive, load_weights()
+    poses = d3dlo.accumulate(d3dlo.predict_motions(net, records, refine=1))
     moved = np.linalg.norm(s.motions()[:, :3, 3], axis=1)
     t, r = metrics.step_errors(s.poses, poses).mean(0)
     assert count(net) == 61290 and moved.mean() > 0.5 and t < 0.15 and r < 0.2
+
+
+@torch.inference_mode()
+def test_in_bfloat16_the_shipped_weights_predict_nearly_the_same(new_drive):
+    (_, records), (net, _) = new_drive, load_weights()
+    p, q = np.r_[:7, 1:8], np.r_[1:8, :7]  # both directions
+    batch = d3dlo.make_batch(records, p, q, net.config)
+    expected = net(batch)
+    with torch.autocast("cpu", torch.bfloat16):
+        got = net(batch)
+    assert got.dtype == torch.bfloat16
+    assert (got.float() - expected).norm() < 0.02 * (expected - expected.mean(0)).norm()
 
 
 @given(SEED)
