@@ -479,13 +479,23 @@ def test_augmented_pairs_still_fit_their_motion(seed):
     assert before.tobytes() == clouds.tobytes()         # nothing else has changed
 
 
-def fit(folder, config, resume=None):
+def fit(folder, config, resume=None, test=None, say=None):
     """Train on `drives()` until the end or an interruption. Returns the lines said."""
     said = []
-    torch.manual_seed(0 if resume is None else 99)      # a resumed net must not depend on how it starts
-    with contextlib.suppress(KeyboardInterrupt):
-        d3dlo.fit(D3DLO(config), *drives(), folder, 7, "cpu", resume, said.append)
+    torch.manual_seed(0 if resume is None else 99)  # a resumed net must not depend on its start
+    with contextlib.suppress(KeyboardInterrupt, BrokenPipeError):
+        d3dlo.fit(D3DLO(config), *drives(), folder, 7, "cpu", resume, say or said.append, test=test)
     return said
+
+
+def stored(folder, name="weights.pt"):
+    return torch.load(folder / name, weights_only=True)
+
+
+def assert_same_model(a, b):
+    """Of two weights files or checkpoints, to the bit."""
+    assert a["step"] == b["step"] and a["model"].keys() == b["model"].keys()
+    assert all(torch.equal(tensor, b["model"][name]) for name, tensor in a["model"].items())
 
 
 @pytest.mark.parametrize("stop, stored, schedule, optimizer, frozen", [     # of 15 steps, in the middle of the eighth and of an epoch
@@ -517,6 +527,56 @@ def test_a_training_goes_on_as_if_never_stopped_and_a_finished_one_stays(tmp_pat
         for name in ("checkpoint.pt", "weights.pt"):
             a, b = load("whole", name), load("part", name)
             assert a["step"] == b["step"] == 15 and all(torch.equal(tensor, b["model"][key]) for key, tensor in a["model"].items())
+
+
+TEST_LOSS = re.compile(r", test loss (\d+\.\d{4})")
+
+
+@table("config", {
+    "short": replace(SMALL, epochs=4, batch=3, augment=True, optimizer="muon",
+                     schedule="one-cycle", frozen=0.25),
+    "the paper's": replace(SMALL, epochs=4, batch=3, swap="random")})
+def test_the_test_loss_changes_nothing_and_is_logged_once_an_epoch(tmp_path, config):
+    test = pairs_of_scans(generator(1), 9)
+    alone, whole = fit(tmp_path / "alone", config), fit(tmp_path / "whole", config, test=test)
+    for name in ("weights.pt", "checkpoint.pt"):
+        assert_same_model(stored(tmp_path / "alone", name), stored(tmp_path / "whole", name))
+    assert [TEST_LOSS.sub("", line) for line in whole] == alone
+    assert [len(TEST_LOSS.findall(line)) for line in whole] == [1] * 4 + [0]
+
+    # The last one is that of the weights in the file, over both directions of all pairs.
+    net, errors = D3DLO(config).eval(), []
+    net.load_state_dict(stored(tmp_path / "whole")["model"])
+    for records, T in zip(*test):
+        for pair, motions in ((records, T), (records[::-1], invert(T))):
+            errors.append(to_vector(d3dlo.predict_motions(net, pair)) - to_vector(motions))
+    last = float(TEST_LOSS.search(whole[3])[1])
+    assert last == pytest.approx(np.abs(errors).mean(), abs=1e-4)
+
+    def stop(line):
+        part.append(line)
+        if "epoch 2" in line:
+            raise KeyboardInterrupt
+    part = []
+    fit(tmp_path / "part", config, test=test, say=stop)
+    checkpoint = stored(tmp_path / "part", "checkpoint.pt")
+    assert part + fit(tmp_path / "part", config, checkpoint, test) == whole
+
+
+@given(st.integers(1, 2000), st.integers(1, 2000))
+@settings(max_examples=10)
+def test_the_test_loss_is_over_at_most_500_fixed_pairs_of_all_sequences(n, m):
+    def pairs(net):  # every scan is known by its number
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(d3dlo, "training_batch", lambda *arguments: (arguments[2], None))
+            parts = d3dlo.held_out_examples(None, [range(n), range(m)], SMALL, "cpu")
+            return [pair for part, _ in parts for pair in part]
+    chosen = pairs(0)
+    everything = [(0, i) for i in range(n)] + [(1, i) for i in range(m)]
+    assert len(chosen) == len(set(chosen)) == min(500, n + m) and chosen == pairs(1)
+    gaps = np.diff([everything.index(pair) for pair in chosen])
+    assert chosen[0] == (0, 0) and chosen[-1] == (1, m - 1)
+    assert n + m == 1 or len(set(gaps)) <= 2  # evenly spread
 
 
 # --------------------------------------------------------------------------------------------------------------- metrics
@@ -951,6 +1011,46 @@ def test_a_training_from_weights_begins_with_them_and_remembers_what_they_saw(he
     assert load_weights("b")[1]["train"] == seen_b["train"]
     d3dlo.evaluate("first", "b", out="results")
     assert json.loads((here / "results" / "results.json").read_text())["sequences"]["00"]["trained_on"]
+
+
+def config_of(run):
+    return json.loads((Path(run) / "config.json").read_text())["config"]
+
+
+def test_with_data_the_papers_settings_are_the_default_and_the_test_loss_is_logged(here):
+    write_root(here / "root", ("00", "03"), scans=4)
+    write_root(here / "alone", ("00",), scans=4)  # the same 00
+    for root in ("root", "alone"):
+        arguments = f"train --data {root} --epochs 2 --out {root}-run"
+        assert d3dlo.main(arguments.split()) == 0
+        assert config_of(f"{root}-run") == Config(epochs=2).as_dict()
+    log = (here / "root-run" / "log.txt").read_text()
+    losses = re.findall(r"^epoch (\d)/2: loss [\d.]+, test loss [\d.]+, learning", log, re.M)
+    assert losses == ["1", "2"]
+    assert "test loss" not in (here / "alone-run" / "log.txt").read_text()
+    assert_same_model(stored(here / "root-run"), stored(here / "alone-run"))
+
+
+@pytest.mark.parametrize("short", [True, False])
+def test_a_recipe_does_not_change_the_network_and_input_of_given_weights(here, short):
+    network = dict(max_range=30.0, plane=False, sa1=SMALL.sa1._replace(n_n=5))
+    save_weights("w.pt", replace(SMALL, **network, epochs=77, lr=0.5, frozen=0.5))
+    write_root(here / "root", scans=4)
+    arguments = "train --data root --weights w.pt --epochs 1 --out run" + " --short" * short
+    assert d3dlo.main(arguments.split()) == 0
+    ours = dict(batch=8, optimizer="muon", lr=1e-2, schedule="one-cycle", swap="both",
+                augment=True, frozen=0.25)
+    papers = dict(batch=16, optimizer="adam", lr=1e-3, schedule="steps", swap="random",
+                  augment=False, frozen=0.0)
+    expected = replace(SMALL, **network, epochs=1, **(ours if short else papers))
+    assert config_of("run") == expected.as_dict()
+
+
+def test_the_version_is_printed(capsys):
+    with pytest.raises(SystemExit) as end:
+        d3dlo.main(["--version"])
+    assert end.value.code == 0 and capsys.readouterr().out == f"d3dlo {d3dlo.__version__}\n"
+    assert re.fullmatch(r"\d+\.\d+\.\d+", d3dlo.__version__)
 
 
 def rewrite(name, change):
