@@ -474,9 +474,29 @@ def test_augmented_pairs_still_fit_their_motion(seed):
         assert_allclose(move(X, q["xyz"]), p["xyz"], atol=1e-4)
         assert_allclose(move(X, q["xyz"][:, None] + q["group"][..., 1:]), p["xyz"][:, None] + p["group"][..., 1:], atol=1e-4)
         assert np.linalg.det(X[:3, :3]) > 0.999 and np.abs(X - Y).max() > 1e-3      # no reflection is left, and something moved
-        assert_array_equal(np.abs(p["xyz"]), np.abs(old["xyz"]))                    # P is at most mirrored
+        assert_array_equal(p["xyz"] * [1, np.sign(p["xyz"][0, 1] * old["xyz"][0, 1]), 1], old["xyz"])
     before["xyz"], before["group"][..., 1:] = clouds["xyz"], clouds["group"][..., 1:]
     assert before.tobytes() == clouds.tobytes()         # nothing else has changed
+
+
+def test_augmentation_mirrors_left_and_right_and_aligns_a_quarter_of_the_pairs():
+    n, rng = 2000, generator(0)
+    far = by_hand(np.array([100, 40, 0, 0, 0, 90.0]))  # a residual motion is not as large
+    scans = np.zeros(2 * n, d3dlo.geometry_dtype(replace(SMALL, sa1=SMALL.sa1._replace(n_fps=16))))
+    scans["xyz"][:] = 1
+    moved, T = d3dlo.augment(scans, np.tile(far, (n, 1, 1)), rng)
+    p = moved["xyz"][:n, 0]
+    assert_array_equal(np.unique(p, axis=0), [[1, -1, 1], [1, 1, 1]])  # y is left, in a half
+    mirrored = p[:, 1] < 0
+    assert abs(mirrored.mean() - 0.5) < 0.05
+    aligned = np.linalg.norm(T[:, :3, 3], axis=1) < 3
+    assert abs(aligned.mean() - 0.25) < 0.05
+    mirror = np.diag([1, -1, 1, 1])
+    for chosen, base in ((aligned, np.eye(4)), (~aligned & mirrored, mirror @ far @ mirror),
+                         (~aligned & ~mirrored, far)):
+        A = to_vector(invert(T[chosen]) @ base)  # Q moves after it has been aligned
+        assert_allclose(A.mean(0), 0, atol=0.15)
+        assert_allclose(A.std(0), [0.25, 0.1, 0.03, 0.1, 0.1, 1.0], rtol=0.15)
 
 
 def fit(folder, config, resume=None, test=None, say=None):
@@ -527,6 +547,113 @@ def test_a_training_goes_on_as_if_never_stopped_and_a_finished_one_stays(tmp_pat
         for name in ("checkpoint.pt", "weights.pt"):
             a, b = load("whole", name), load("part", name)
             assert a["step"] == b["step"] == 15 and all(torch.equal(tensor, b["model"][key]) for key, tensor in a["model"].items())
+
+
+@table("ends_with", {"the reader of stdout has gone": BrokenPipeError, "a bug": ZeroDivisionError})
+def test_whatever_ends_a_training_run_between_two_steps_it_leaves_a_checkpoint(tmp_path, ends_with):
+    config = replace(SMALL, epochs=4, batch=3, augment=True)
+
+    def say(line):
+        part.append(line)
+        if "epoch 2" in line:
+            raise ends_with
+    whole, part = fit(tmp_path / "whole", config), []
+    with contextlib.suppress(ZeroDivisionError):
+        fit(tmp_path / "part", config, say=say)
+    checkpoint = stored(tmp_path / "part", "checkpoint.pt")
+    assert checkpoint["step"] == 6 and os.listdir(tmp_path / "part") == ["checkpoint.pt"]
+    assert part + fit(tmp_path / "part", config, checkpoint) == whole
+    assert_same_model(stored(tmp_path / "part"), stored(tmp_path / "whole"))
+
+
+@table("owner, name", {"the loss": (d3dlo.UnweightedLoss, "forward"),
+                       "the backward pass": (torch.Tensor, "backward"),
+                       "the optimiser": (torch.optim.Adam, "step")})
+def test_an_exception_within_a_step_leaves_the_previous_checkpoint(
+        tmp_path, monkeypatch, owner, name):
+    config, done, before = replace(SMALL, epochs=4, batch=3), [], []
+
+    def work_and_fail(*arguments, work=getattr(owner, name), **options):
+        done.append(work(*arguments, **options))
+        if len(done) == 5:
+            before.append((tmp_path / "part" / "checkpoint.pt").read_bytes())
+            raise MemoryError
+        return done[-1]
+    fit(tmp_path / "whole", config)
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, work_and_fail)
+        patch.setattr(d3dlo, "STORE_EVERY", 0)  # a checkpoint after each step
+        with pytest.raises(MemoryError):
+            fit(tmp_path / "part", config)
+    assert before == [(tmp_path / "part" / "checkpoint.pt").read_bytes()]
+    checkpoint = stored(tmp_path / "part", "checkpoint.pt")
+    assert checkpoint["step"] == 4
+    fit(tmp_path / "part", config, checkpoint)
+    assert_same_model(stored(tmp_path / "part"), stored(tmp_path / "whole"))
+
+
+@pytest.mark.parametrize("tested", [False, True])
+@pytest.mark.parametrize("epochs, batch", [(50, 3), (1, 10)])  # (1, 10): in the last step
+def test_a_training_run_that_diverges_says_so_and_stores_no_nan(tmp_path, tested, epochs, batch):
+    config = replace(SMALL, epochs=epochs, batch=batch, lr=1e30)
+    with pytest.raises(ValueError, match=r"not finite at step [1-9], learning rate 1\.0e\+"):
+        fit(tmp_path, config, test=drives() if tested else None)
+    assert not any(tmp_path.iterdir())
+
+
+def test_learning_rates_drop_to_a_tenth_at_epochs_300_and_400_of_500(tmp_path):
+    optimizer, rates = torch.optim.SGD([torch.zeros(1)]), []
+    optimizer.param_groups[0]["lr"] = 1.0
+    scheduler = d3dlo.make_scheduler(optimizer, Config(), 500 * 2)  # 2 steps an epoch
+    for _ in range(500 * 2):
+        rates.append(scheduler.get_last_lr()[0])
+        optimizer.step()
+        scheduler.step()
+    assert_allclose(rates, [1.0] * 600 + [0.1] * 200 + [0.01] * 200)
+    said = fit(tmp_path, replace(SMALL, epochs=10, batch=5, lr=0.002))
+    rates = re.findall(r"learning rate (\S+)", "\n".join(said))
+    assert rates == ["2.0e-03"] * 6 + ["2.0e-04"] * 2 + ["2.0e-05"] * 2
+
+
+@pytest.mark.parametrize("frozen", [0, 0.5])
+def test_statistics_are_recomputed_at_the_end_unless_they_were_fixed(tmp_path, frozen):
+    geometry, motions = drives()  # all 10 pairs in each batch, so all batches have the same statistics
+    config = replace(SMALL, epochs=6, batch=10, lr=1e-2, frozen=frozen)
+    fit(tmp_path, config)
+    weights, checkpoint = (stored(tmp_path, name)["model"] for name in ("weights.pt", "checkpoint.pt"))
+    if frozen:  # trained with these statistics
+        assert all(torch.equal(tensor, checkpoint[name]) for name, tensor in weights.items())
+        return
+    net = D3DLO(config).train()
+    net.load_state_dict(weights)
+    for norm in norms_of(net):
+        norm.momentum = 1  # the statistics of the one batch
+    pairs = [(s, i) for s in range(2) for i in range(5)]
+    net(d3dlo.training_batch(geometry, motions, pairs, config, None)[0])
+    means = [name for name in weights if name.endswith("running_mean")]
+    for name in means:
+        torch.testing.assert_close(weights[name], net.state_dict()[name], rtol=1e-3, atol=1e-3)
+    assert max((weights[name] - checkpoint[name]).abs().max() for name in means) > 0.05
+
+
+def test_muon_trains_the_hidden_matrices_with_steps_as_large_as_adams():
+    torch.manual_seed(0)
+    net = D3DLO(replace(SMALL, optimizer="muon"))
+    adam, muon = d3dlo.make_optimizers(net, d3dlo.UnweightedLoss())
+    matrices = [m.weight for m in net.modules() if isinstance(m, torch.nn.Linear)][:-1]
+    assert {*muon.param_groups[0]["params"]} == {*matrices}
+    assert {*adam.param_groups[0]["params"]} == {*net.parameters()} - {*matrices}
+    before = [W.detach().clone() for W in matrices]
+    for W in matrices:
+        W.grad = torch.zeros_like(W)
+    muon.step()
+    assert all(map(torch.equal, matrices, before))  # without weight decay
+    for W in matrices:
+        W.grad = torch.randn_like(W)
+    muon.step()
+    for W, old in zip(matrices, before):
+        size = (W - old).square().mean().sqrt() / net.config.lr
+        assert 0.1 < size < 0.3  # 0.2, as Adam's steps have (Liu et al., "Muon is scalable")
 
 
 TEST_LOSS = re.compile(r", test loss (\d+\.\d{4})")
@@ -634,6 +761,18 @@ def test_errors_refuse_lengths_that_differ(error):
         error(straight(20), straight(19))
 
 
+@given(SEED)
+def test_absolute_errors_are_distances_in_space_and_rmse_the_root_of_the_mean_square(seed):
+    rng = generator(seed)
+    T = trajectory(rng, 20)
+    apart = rng.normal(size=(20, 3)) * [1, 2, 4]
+    moved = T.copy()
+    moved[:, :3, 3] += apart
+    errors = metrics.absolute_errors(T, moved)
+    assert_allclose(errors, [math.hypot(*xyz) for xyz in apart], atol=1e-9)
+    assert metrics.rmse(errors) ** 2 == pytest.approx(errors.var() + errors.mean() ** 2)
+
+
 @given(SEED, st.integers(1, 30))
 def test_pose_files_survive_the_round_trip(tmp_path, seed, n):
     T, path = trajectory(generator(seed), n), tmp_path / "new" / "a.txt"
@@ -653,6 +792,25 @@ def test_remove_plane_takes_the_ground_and_leaves_the_box(seed, roll, pitch):
     scan = np.r_[scan, np.full((2, 4), np.nan, np.float32)][order]
     left = scan[order >= 3000]                          # all of the ground goes, nothing else; the order stays, and NaN too
     assert_array_equal(kitti.remove_plane(scan, seed=seed), left)
+
+
+def test_the_ground_is_what_lies_within_15_cm_of_the_plane():
+    rng = generator(0)
+    ground = np.c_[rng.uniform(-20, 20, (3000, 2)), np.zeros(3000), rng.random(3000)]
+    heights = np.array([-0.17, -0.13, 0.13, 0.17])
+    near = np.c_[rng.uniform(-20, 20, (40, 2)), np.repeat(heights, 10), rng.random(40)]
+    left = kitti.remove_plane(np.r_[ground, near].astype(np.float32))
+    assert_array_equal(left, near[np.abs(near[:, 2]) > 0.15].astype(np.float32))
+
+
+@pytest.mark.parametrize("plane", [True, False])
+def test_without_the_plane_no_point_of_the_ground_is_sampled(plane):
+    rng = generator(0)
+    ground = np.c_[rng.uniform(-20, 20, (3000, 2)), np.full(3000, -1.7), rng.random(3000)]
+    scan = np.r_[ground, cloud(rng, 500) + [0, 0, 3, 0]].astype(np.float32)
+    record = scan_geometry(scan, replace(SMALL, plane=plane))
+    assert (record["xyz"][:, 2].min() < -1.5) == plane
+    assert record["stats"][0] == (3500 if plane else 500)
 
 
 @pytest.mark.parametrize("N, thick", [(0, 0), (2, 0), (500, 0), (5000, 0.1)])
@@ -1135,6 +1293,8 @@ def test_metrics_on_the_command_line(here, capsys):
     assert figures(capsys.readouterr().out, "short")[:4] == ["0", "-", "-", "0.0000"]
     assert metrics.main(["gt/03.txt", "est/03.txt"]) == 0
     expected, out = devkit(gt, est)[:, 3], capsys.readouterr().out
+    ate = math.sqrt(sum((0.01 * i) ** 2 for i in range(300)) / 300)
+    assert figures(out, "03")[5:] == [f"{ate:.3f}", "0.0100", "0.0000"]
     assert figures(out, "03")[:5] == [str(len(expected)), f"{expected.mean():.3f}", "0.00000", "0.0100", "0.0000"]
     assert figures(out, "100 m")[1] == "1.010" and figures(out, "200 m")[1] == "1.005"
     assert metrics.main(["gt", "est"]) == 0
