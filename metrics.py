@@ -71,6 +71,36 @@ def write_poses(path: str | Path, T: np.ndarray) -> None:
         np.savetxt(temporary, np.asarray(T)[:, :3].reshape(-1, 12), fmt="%.9e")
 
 
+def write_tum(path: str | Path, T: np.ndarray, times: np.ndarray) -> None:
+    """Write poses (n,4,4) at `times` (n,) [s] as a TUM trajectory file, through a temporary file.
+
+    A row is t x y z qx qy qz qw, with qw >= 0, in the frame of the poses. Raises ValueError when
+    there is not one time per pose.
+    """
+    T, times = np.asarray(T, float), np.asarray(times, float)
+    if len(T) != len(times):
+        raise ValueError(f"{path}: {len(T)} poses but {len(times)} times; give one time per pose")
+    with replacing(path) as temporary:
+        np.savetxt(temporary, np.c_[times, T[:, :3, 3], _quaternions(T[:, :3, :3])], fmt="%.9f")
+
+
+def _quaternions(R):
+    """Rotation matrices (n,3,3) -> unit quaternions (n,4) as x, y, z, w, with w >= 0.
+
+    The sums and differences of R's entries below form the matrix 4 q q^T, so each row is a multiple
+    of q. The row with the largest diagonal entry is the one that rounding affects least.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = R.transpose(1, 2, 0)
+    outer = np.array([[1 + a - e - i, b + d, c + g, h - f],
+                      [b + d, 1 - a + e - i, f + h, c - g],
+                      [c + g, f + h, 1 - a - e + i, d - b],
+                      [h - f, c - g, d - b, 1 + a + e + i]]).transpose(2, 0, 1)     # (n,4,4)
+    largest = np.diagonal(outer, axis1=1, axis2=2).argmax(axis=1)
+    q = outer[np.arange(len(R)), largest]                                           # (n,4)
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    return np.where(q[:, 3:] < 0, -q, q)
+
+
 def _same_length(T_gt, T_est):
     T_gt, T_est = np.asarray(T_gt, float), np.asarray(T_est, float)
     if T_gt.shape != T_est.shape:
@@ -173,17 +203,37 @@ def picture(width, height):
     return Figure(figsize=(width, height), layout="constrained")
 
 
+def view_from_above(T: np.ndarray) -> tuple[np.ndarray, str, str]:
+    """How to draw poses (n,4,4) from above: a matrix (2,3) and the labels of the two axes.
+
+    The matrix maps positions to metres right and forward, as seen in the first frame. The mean step,
+    each step in its own frame, tells the frame: a vehicle moves along z in a camera's frame (x right,
+    y down, z forward) and along x in a LiDAR's (x forward, y left, z up). Without any motion the frame
+    is taken to be the camera's, as in KITTI's pose files.
+    """
+    steps = np.linalg.inv(T[:-1]) @ T[1:]
+    x, y, z = steps[:, :3, 3].sum(axis=0)               # the direction of the mean
+    if abs(z) >= np.hypot(x, y):
+        return np.array([[1, 0, 0], [0, 0, 1]]), "camera x, right [m]", "camera z, forward [m]"
+    return np.array([[0, -1, 0], [1, 0, 0]]), "LiDAR -y, right [m]", "LiDAR x, forward [m]"
+
+
 def draw(path, trajectories):
-    """{name: (T_gt or None, T_est)} in KITTI's camera frame -> a PNG, for each name a row: the path from above, and KITTI's errors by the
-    length of the segments. ValueError without matplotlib."""
-    figure = picture(10.5, 3.1 * len(trajectories))
-    rows = figure.subplots(len(trajectories), 3, squeeze=False)
+    """{name: (T_gt or None, T_est)}, poses (n,4,4) in a camera's or a LiDAR's frame -> a PNG.
+
+    Each name is a row: the path from above and, if there is any ground truth, KITTI's errors by the
+    length of the segments. Raises ValueError without matplotlib.
+    """
+    columns = 3 if any(T_gt is not None for T_gt, _ in trajectories.values()) else 1
+    figure = picture(3.5 * columns, 3.1 * len(trajectories))
+    rows = figure.subplots(len(trajectories), columns, squeeze=False)
     for (name, (T_gt, T_est)), (above, *errors) in zip(trajectories.items(), rows):
+        view, right, forward = view_from_above(T_est if T_gt is None else T_gt)
         for T, style in (T_gt, dict(color="0.65", lw=4, label="truth")), (T_est, dict(color="black", lw=1.2, label="estimate")):
             if T is not None:
-                above.plot(T[:, 0, 3], T[:, 2, 3], **style)  # KITTI's camera: x right, z forward
+                above.plot(*view @ T[:, :3, 3].T, **style)
         above.plot(0, 0, "ko", ms=5)
-        above.set(title=f"{name} from above, from the dot", xlabel="x [m]", ylabel="z [m]", aspect="equal", adjustable="datalim")
+        above.set(title=f"{name} from above, from the dot", xlabel=right, ylabel=forward, aspect="equal", adjustable="datalim")
         above.legend(frameon=False)
         lengths = by_length([] if T_gt is None else [segment_errors(T_gt, T_est)])
         for axis, error, unit in zip(errors, ("E_t", "E_r"), ("%", "deg/m")):

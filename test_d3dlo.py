@@ -527,6 +527,39 @@ def test_pose_files_survive_the_round_trip(tmp_path, seed, n):
     assert os.listdir(path.parent) == ["a.txt"] and np.loadtxt(path, ndmin=2).shape == (n, 12)
 
 
+@given(SEED, st.sampled_from([0, 1e-9, 1e-4, 1, 179.9999, 180]))
+def test_tum_files_hold_times_positions_and_unit_quaternions(tmp_path, seed, degrees):
+    rng = generator(seed)
+    axes = np.r_[rng.normal(size=(4, 3)), np.eye(3), -np.eye(3)]                    # half turns about an axis too
+    T = motion(rng, n=len(axes))
+    T[:, :3, :3] = Rotation.from_rotvec(np.radians(degrees) * axes / np.linalg.norm(axes, axis=1, keepdims=True)).as_matrix()
+    times = 1.3e9 + np.cumsum(rng.uniform(0.05, 0.2, len(T)))                       # seconds since 1970
+    metrics.write_tum(tmp_path / "a.tum", T, times)
+    rows = np.loadtxt(tmp_path / "a.tum")
+    assert rows.shape == (len(T), 8) and os.listdir(tmp_path) == ["a.tum"]
+    assert_allclose(rows[:, 0], times, rtol=0, atol=1e-6)
+    assert_allclose(rows[:, 1:4], T[:, :3, 3], atol=1e-8)
+    assert_allclose(np.linalg.norm(rows[:, 4:], axis=1), 1, atol=1e-8)
+    assert_allclose(Rotation.from_quat(rows[:, 4:]).as_matrix(), T[:, :3, :3], atol=1e-8)       # x, y, z, w
+    assert (rows[:, 7] >= 0).all()
+    with pytest.raises(ValueError, match="10 poses but 9 times"):
+        metrics.write_tum(tmp_path / "b.tum", T, times[:-1])
+    assert os.listdir(tmp_path) == ["a.tum"]
+
+
+@given(SEED, st.sampled_from([-1, 1]))
+def test_a_path_from_above_is_the_same_in_the_camera_s_and_the_lidar_s_frame(seed, gear):
+    rng = generator(seed)
+    steps = np.abs(rng.normal(size=(50, 6))) * [1, 0.05, 0.05, 1, 1, 6] * [gear, *rng.choice([-1, 1], 5)]     # reversing too
+    lidar = d3dlo.accumulate(from_vector(steps))
+    Tr = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])       # a camera in the same place
+    camera = kitti.velo_to_camera(lidar, Tr)
+    for T, labels in (lidar, ["LiDAR -y, right [m]", "LiDAR x, forward [m]"]), (camera, ["camera x, right [m]", "camera z, forward [m]"]):
+        view, *named = metrics.view_from_above(T)
+        assert named == labels
+        assert_allclose(view @ T[:, :3, 3].T, [-lidar[:, 1, 3], lidar[:, 0, 3]], atol=1e-9)
+
+
 # ------------------------------------------------------------------------------------------------------------------ data
 
 @given(SEED, st.floats(-8, 8), st.floats(-8, 8))
@@ -1008,9 +1041,16 @@ def test_pictures_are_drawn_where_there_is_matplotlib(here, monkeypatch, capsys)
         patch.setitem(sys.modules, "matplotlib.figure", None)                       # as if it were not installed
         fails_with_one_line(metrics.main, arguments, "matplotlib", capsys)
     pytest.importorskip("matplotlib")
+    drawn, figure_of = [], metrics.picture
+    monkeypatch.setattr(metrics, "picture", lambda *size: drawn.append(figure_of(*size)) or drawn[-1])
     assert metrics.main(arguments) == 0
     metrics.draw("b.png", {"11": (None, T)})                                        # without ground truth
     assert all(Path(name).read_bytes().startswith(b"\x89PNG") for name in ("a.png", "b.png"))
+    assert [len(figure.axes) for figure in drawn] == [3, 1]                         # without errors there is only the path
+    for figure in drawn:                                # the poses are a LiDAR's: x forward, y left
+        path = figure.axes[0].lines[-2]
+        assert_allclose(path.get_xydata(), np.c_[-T[:, 1, 3], T[:, 0, 3]], atol=1e-6)
+        assert figure.axes[0].get_ylabel() == "LiDAR x, forward [m]" and all(axis.get_xlabel() and axis.get_ylabel() for axis in figure.axes)
 
 
 def test_the_readme_s_python_runs_and_its_commands_parse(here, monkeypatch):
