@@ -22,19 +22,53 @@ SPLITS = {"train": ("00", "01", "02", "08", "09"), "test": ("03", "04", "05", "0
 
 # ---------------------------------------------------------------------------------------------------------------- files
 
+FIVE_FLOATS = ("If it is nuScenes', with five floats per point, convert each file with "
+               "np.save(NEW, np.fromfile(OLD, np.float32).reshape(-1, 5)[:, :4])")
+
+
 def _check_scan_size(path, size):
     if size == 0 or size % 16:
-        raise ValueError(f"{path} has {size} bytes, but a KITTI scan has 16 (four float32) for each point: copy or unpack it again.")
+        raise ValueError(f"{path} has {size} bytes, but a scan has 16 (four float32) per point: "
+                         f"copy or unpack it again. {FIVE_FLOATS}.")
 
 
-def read_scan(path: str | Path) -> np.ndarray:
-    """One velodyne/*.bin -> (N,4) float32: x, y, z [m] in the Velodyne frame, intensity 0..1, as in the file (NaN included).
-    Raises OSError when it cannot be read, ValueError when it is empty, of another format, or its size is no multiple of 16 bytes."""
-    data = Path(path).read_bytes()
+def read_scan(path: str | Path, intensity_max: float = 1) -> np.ndarray:
+    """Read one scan, a .bin or .npy file.
+
+    Returns (N,4) float32: x, y, z [m] in the LiDAR's frame, and intensity divided by `intensity_max`.
+    NaN is kept. A .bin file holds four float32 per point, as KITTI's. A .npy file holds an array
+    (N,3) or (N,4); without a fourth column the intensities are 0. Raises OSError when the file cannot
+    be read, ValueError when it is empty, damaged or of another format.
+    """
+    path = Path(path)
+    scan = _read_npy(path) if path.suffix == ".npy" else _read_bin(path)
+    scan[:, 3] /= intensity_max
+    return scan
+
+
+def _read_bin(path):
+    data = path.read_bytes()
     if data.startswith((b"\x93NUMPY", b"ply\n", b"ply\r", b"# .PCD")):
         raise ValueError(f"{path} is no KITTI scan but another format: read it with its own library and hand over x, y, z, intensity.")
     _check_scan_size(path, len(data))
     return np.frombuffer(data, "<f4").reshape(-1, 4).astype(np.float32)  # (N,4), a copy that may be written to
+
+
+def _read_npy(path):
+    try:
+        points = np.load(path, allow_pickle=False)
+    except OSError:
+        raise
+    except Exception:  # np.load raises many exception types; all of them mean a corrupt file
+        raise ValueError(f"{path} is no NumPy file, or a damaged one: save the scan again.") from None
+    shape = getattr(points, "shape", ())  # an archive of several arrays has none
+    if len(shape) != 2 or shape[0] == 0 or shape[1] not in (3, 4) or points.dtype.kind not in "fiu":
+        raise ValueError(f"{path} has shape {shape}, but a scan is an array of numbers (N,3) or (N,4): "
+                         "save the columns x, y, z and intensity.")
+    scan = np.zeros((len(points), 4), np.float32)
+    with np.errstate(over="ignore"):  # numbers too large for float32 become infinite
+        scan[:, :points.shape[1]] = points
+    return scan
 
 
 def read_calib(path: str | Path) -> np.ndarray:
@@ -107,6 +141,7 @@ class Sequence:
 
     name, scan_paths (list of n paths), Tr (4,4) = T_cam0_velo, poses_cam (n,4,4) as in the file or None, poses (n,4,4) = T_0t in the
     Velodyne frame or None. Raises FileNotFoundError or ValueError when anything is missing or does not fit together."""
+    intensity_max = 1  # of the files; KITTI's intensities are within 0..1
 
     def __init__(self, root, name):
         self.name, self.folder = name, Path(root) / "sequences" / name
@@ -134,39 +169,114 @@ class Sequence:
 
     def scan(self, i: int) -> np.ndarray:
         """Scan i as (N,4) float32, see `read_scan`."""
-        return read_scan(self.scan_paths[i])
+        return read_scan(self.scan_paths[i], self.intensity_max)
 
     def motions(self) -> np.ndarray:
         """(n-1,4,4) T_{t,t+1} = inv(T_t) @ T_{t+1} (paper eq. 1) in the Velodyne frame: maps points of scan t+1 into scan t.
         Raises ValueError when the sequence has no ground truth."""
         if self.poses is None:
-            raise ValueError(f"Sequence {self.name} has no ground truth: put the official poses/{self.name}.txt beside sequences/ "
+            raise ValueError(f"Sequence {self.name} has no ground truth: put it into ROOT/poses/{self.name}.txt beside ROOT/sequences "
                              f"(SemanticKITTI's sequences/{self.name}/poses.txt is no truth, SuMa estimated it).")
         return invert(self.poses[:-1]) @ self.poses[1:]
 
 
+class ScanFolder(Sequence):
+    """A plain folder of scans as a sequence: *.bin or *.npy, in natural order (2 before 10).
+
+    name is the folder's. There is no calibration and no ground truth, so Tr, poses_cam and poses are
+    None and poses are in the LiDAR's frame. intensity_max is what intensities are divided by, 1 or
+    255. times (n,) are the seconds in the folder's times.txt, or else those of 10 scans a second.
+    notes is a list of lines that say what was assumed. Raises ValueError when the files do not fit
+    together or are no scans.
+    """
+
+    def __init__(self, folder):
+        self.folder = Path(folder)
+        self.name = self.folder.resolve().name
+        self.scan_paths = scans_in(folder)
+        self.Tr = self.poses_cam = self.poses = None
+        if len({path.suffix for path in self.scan_paths}) > 1:
+            raise ValueError(f"{folder} holds both .bin and .npy files: move one kind elsewhere.")
+        for path in self.scan_paths:
+            if path.suffix == ".bin":
+                _check_scan_size(path, path.stat().st_size)
+        largest = _largest_intensity(self.scan_paths)
+        self.intensity_max = 255 if largest > 1 else 1
+        self.times, self.notes = 0.1 * np.arange(len(self)), []
+        if largest == 0:
+            self.notes.append("there are no intensities; zeros are used, so expect larger errors")
+        if largest > 1:
+            self.notes.append(f"intensities reach {largest:.4g}; all are divided by 255")
+        if (self.folder / "times.txt").exists():
+            self.times = _read_times(self.folder / "times.txt", len(self))
+        else:
+            self.notes.append("there is no times.txt, one time in seconds per line; "
+                              "10 scans a second are assumed")
+
+
+def scans_in(folder):
+    """The *.bin and *.npy files of a folder, in natural order: list of paths."""
+    paths = [path for path in Path(folder).glob("[!.]*") if path.suffix in (".bin", ".npy")]
+    return sorted(paths, key=lambda path: re.sub(r"\d+", lambda digits: digits[0].zfill(20), path.name))
+
+
+def _largest_intensity(paths):
+    """The largest intensity of ten scans spread over a folder. Raises ValueError if it cannot be one."""
+    largest = 0
+    for i in np.unique(np.linspace(0, len(paths) - 1, 10).astype(int)):
+        intensity = read_scan(paths[i])[:, 3]
+        intensity = intensity[np.isfinite(intensity)]
+        if intensity.min(initial=0) < 0:
+            raise ValueError(f"{paths[i]}: the fourth value of a point is {intensity.min():.4g}, but an intensity is "
+                             f"not negative, so these are not x, y, z, intensity. {FIVE_FLOATS}.")
+        if intensity.max(initial=0) > 255:
+            raise ValueError(f"{paths[i]} has intensities up to {intensity.max():.4g}, but they must lie within "
+                             "0..1 or 0..255: rescale those of all scans.")
+        largest = max(largest, intensity.max(initial=0))
+    return largest
+
+
+def _read_times(path, n):
+    """(n,) seconds, one per line and increasing. Raises ValueError when the file holds anything else."""
+    try:
+        times = np.array(path.read_bytes().split(), dtype=float)
+    except ValueError:
+        times = np.empty(0)
+    if len(times) != n or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        raise ValueError(f"{path} must hold {n} increasing numbers, the time of each scan in seconds: "
+                         "correct it, or remove it to assume 10 scans a second.")
+    return times
+
+
 def sequence_names(root: str | Path) -> list[str]:
-    """The sequences of ROOT that have scans. Raises FileNotFoundError when there are none, as where ROOT is not in KITTI's odometry layout."""
+    """The sequences of ROOT that have scans; a plain folder of scans is one, with the folder's name.
+    Raises FileNotFoundError when there are none, as in an unknown layout."""
     root = Path(root)
+    if not (root / "sequences").exists() and scans_in(root):
+        return [root.resolve().name]
     there = sorted(p.parent.name for p in root.glob("sequences/[!.]*/velodyne") if next(p.glob("*.bin"), None))
     if not there:
         raw = any(re.search(r"_drive_\d+|^velodyne_points$", p.name) for p in (root, *root.glob("*"), *root.glob("*/*")))
-        raise FileNotFoundError(f"{root} has no sequences{', it is in the layout of KITTI raw data' if raw else ''}: expected "
-                                "ROOT/sequences/00/{velodyne/000000.bin, calib.txt} and ROOT/poses/00.txt, as KITTI's archives unpack.")
+        hint = "it looks like KITTI raw data, convert that with `python kitti.py raw DRIVE ROOT`. " if raw else ""
+        raise FileNotFoundError(
+            f"{root} has no scans in a known layout: {hint}Known are a folder of *.bin or *.npy, and KITTI's odometry "
+            "layout, ROOT/sequences/00/{velodyne/000000.bin, calib.txt} and ROOT/poses/00.txt.")
     return there
 
 
 def open_sequences(root: str | Path, names: str | list[str] | None = None) -> list[Sequence]:
     """ROOT and names -> list of `Sequence`, in the order given, each once. A name is a folder under ROOT/sequences, a split of SPLITS (as
-    much of it as there is) or 'all'; None is 'all'. Raises ValueError for an unknown name or a split of which nothing is there, and whatever
-    `sequence_names` and `Sequence` raise."""
+    much of it as there is) or 'all'; None is 'all'. A ROOT without sequences/ is one `ScanFolder`. Raises ValueError for an unknown name or
+    a split of which nothing is there, and whatever `sequence_names`, `Sequence` and `ScanFolder` raise."""
     there = sequence_names(root)
     choices = {split: [n for n in part if n in there] for split, part in SPLITS.items()} | {"all": there} | {n: [n] for n in there}
     names = ["all"] if names is None else [names] if isinstance(names, str) else list(names)
     for name in names:
         if not choices.get(name):
             raise ValueError(f"{root} has no sequence or split {name!r} with scans: there are {' '.join(n for n in choices if choices[n])}.")
-    return [Sequence(root, n) for n in dict.fromkeys(n for name in names for n in choices[name])]
+    chosen = dict.fromkeys(n for name in names for n in choices[name])
+    plain = not (Path(root) / "sequences").exists()
+    return [ScanFolder(root) if plain else Sequence(root, n) for n in chosen]
 
 
 # ------------------------------------------------------------------------------------------------------------ the plane

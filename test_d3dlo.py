@@ -649,6 +649,107 @@ def write_root(root, names=("00",), scans=6, size=1100, step=1.0):
     return root
 
 
+def write_folder(folder, scans=12, size=50, save=np.save, name="scan {}.npy", scale=1, columns=4):
+    """A plain folder of random scans, numbered from 1 -> the scans."""
+    rng = generator(0)
+    folder.mkdir()
+    made = [cloud(rng, size)[:, :columns] * np.float32([1, 1, 1, scale][:columns]) for _ in range(scans)]
+    for i, scan in enumerate(made, 1):
+        save(folder / name.format(i), scan)
+    return made
+
+
+def save_bin(path, scan):
+    scan.tofile(path)
+
+
+@table("save, name", {"bin": (save_bin, "{}.pcd.bin"), "npy": (np.save, "scan-{}-of-12.npy")})
+def test_a_folder_of_scans_is_one_sequence_in_natural_order(tmp_path, save, name):
+    scans = write_folder(tmp_path / "drive", save=save, name=name)
+    (tmp_path / "drive" / "._1.bin").write_text("left by another system")
+    (tmp_path / "drive" / "notes.txt").write_text("not a scan")
+    s, = kitti.open_sequences(tmp_path / "drive")
+    assert kitti.sequence_names(tmp_path / "drive") == [s.name] == ["drive"] and len(s) == 12
+    for i, scan in enumerate(scans):                    # 2 comes before 10
+        assert s.scan(i).dtype == np.float32
+        assert_array_equal(s.scan(i), scan)
+    assert s.Tr is None and s.poses is None and s.poses_cam is None
+    with pytest.raises(ValueError, match="drive has no ground truth"):
+        s.motions()
+    with pytest.raises(ValueError, match="'00'.*drive"):
+        kitti.open_sequences(tmp_path / "drive", ["00"])
+
+
+def test_times_of_a_folder_are_those_of_its_file_or_of_ten_scans_a_second(tmp_path):
+    write_folder(tmp_path / "drive")
+    s, = kitti.open_sequences(tmp_path / "drive")
+    assert_allclose(s.times, np.arange(12) / 10)
+    assert "10 scans a second" in " ".join(s.notes)
+    times = 1.3e9 + np.arange(12) * 0.25
+    np.savetxt(tmp_path / "drive" / "times.txt", times, fmt="%.6f")
+    s, = kitti.open_sequences(tmp_path / "drive")
+    assert_allclose(s.times, times, rtol=0, atol=1e-6)
+    assert s.notes == []
+
+
+@pytest.mark.parametrize("scale, columns, divisor, words", [
+    (0.9, 4, 1, ""), (255, 4, 255, "255"), (2, 4, 255, "255"), (1, 3, 1, "no intensities"), (0, 4, 1, "no intensities")])
+def test_intensities_of_a_folder_are_brought_to_0_to_1(tmp_path, scale, columns, divisor, words):
+    scans = write_folder(tmp_path / "drive", scale=scale, columns=columns)
+    (tmp_path / "drive" / "times.txt").write_text("\n".join(map(str, range(12))))
+    s, = kitti.open_sequences(tmp_path / "drive")
+    for i, scan in enumerate(scans):
+        assert_array_equal(s.scan(i)[:, :3], scan[:, :3])
+        assert_array_equal(s.scan(i)[:, 3], scan[:, 3] / np.float32(divisor) if columns == 4 else np.zeros(50))
+    assert len(s.notes) == bool(words) and words in "".join(s.notes)
+
+
+def test_ten_scans_spread_over_a_folder_decide_on_the_intensities_of_all(tmp_path):
+    scans = write_folder(tmp_path / "drive", scans=37)
+    looked_at = set(range(0, 37, 4))                    # 10 of 37, the first and the last among them
+    for bright in range(37):
+        path = tmp_path / "drive" / f"scan {bright + 1}.npy"
+        np.save(path, scans[bright] * np.float32([1, 1, 1, 200]))
+        s, = kitti.open_sequences(tmp_path / "drive")
+        assert s.intensity_max == (255 if bright in looked_at else 1)
+        assert_array_equal(s.scan(5)[:, 3], np.load(s.scan_paths[5])[:, 3] / np.float32(s.intensity_max))
+        np.save(path, scans[bright])
+
+
+@table("spoil, words", {       # what is done to a good folder of 12 scans, and what the complaint must name
+    "five floats, as nuScenes": (lambda folder: five_floats(folder, 52), ("1.bin", "reshape(-1, 5)[:, :4]", "nuScenes")),
+    "five floats, of a size that four do not have": (lambda folder: five_floats(folder, 51), ("1.bin", "reshape(-1, 5)[:, :4]", "nuScenes")),
+    "intensities of 16 bits": (lambda folder: np.save(folder / "scan 1.npy", np.full((9, 4), 300)), ("scan 1.npy", "300", "rescale")),
+    "negative intensities": (lambda folder: np.save(folder / "scan 12.npy", np.full((9, 4), -0.5)), ("scan 12.npy", "-0.5")),
+    "two kinds of files": (lambda folder: np.zeros(8, np.float32).tofile(folder / "0.bin"), ("drive", ".bin and .npy")),
+    "five columns": (lambda folder: np.save(folder / "scan 1.npy", np.ones((9, 5))), ("scan 1.npy", "(9, 5)")),
+    "no points": (lambda folder: np.save(folder / "scan 1.npy", np.ones((0, 4))), ("scan 1.npy", "(0, 4)")),
+    "words": (lambda folder: np.save(folder / "scan 1.npy", np.full((9, 4), "x")), ("scan 1.npy", "numbers")),
+    "an archive": (lambda folder: np.savez(open(folder / "scan 1.npy", "wb"), np.ones((9, 4))), ("scan 1.npy", "(N,4)")),
+    "a damaged file": (lambda folder: (folder / "scan 1.npy").write_bytes(b"\x93NUMPY damaged"), ("scan 1.npy", "damaged")),
+    "code": (lambda folder: np.save(folder / "scan 1.npy", np.array([Mischief()]), allow_pickle=True), ("scan 1.npy",)),
+    "a time too few": (lambda folder: (folder / "times.txt").write_text("1 2 3"), ("times.txt", "12")),
+    "times that go back": (lambda folder: (folder / "times.txt").write_text(" ".join(map(str, [*range(11), 0]))), ("times.txt", "increasing")),
+    "times in words": (lambda folder: (folder / "times.txt").write_text("2011-09-26 " * 12), ("times.txt", "seconds")),
+})
+def test_a_folder_that_is_no_drive_is_refused_in_one_line(here, spoil, words):
+    write_folder(here / "drive")
+    spoil(here / "drive")
+    before = files_of(here)
+    with pytest.raises(ValueError) as refused:
+        kitti.open_sequences(here / "drive")
+    assert all(word in str(refused.value) for word in words) and "\n" not in str(refused.value), refused.value
+    assert files_of(here) == before                     # no code was run
+
+
+def five_floats(folder, points):
+    """Scans as nuScenes': x, y, z, intensity up to 255 and the number of the beam."""
+    for path in folder.iterdir():
+        scan = cloud(generator(1), points) * np.float32([1, 1, 1, 255])
+        np.c_[scan, np.arange(points) % 32].astype(np.float32).tofile(path.with_suffix(".bin"))
+        path.unlink()
+
+
 def test_the_cache_holds_what_scan_geometry_says_and_is_made_anew_when_anything_changes(tmp_path):
     root, cache = write_root(tmp_path / "root", ("00", "drive"), size=60), tmp_path / "cache"
 
@@ -918,8 +1019,8 @@ SCAN, POSES, CALIB = "sequences/00/velodyne/000005.bin", "poses/00.txt", "sequen
 
 
 @table("spoil, words", {        # what is done to a good root, and what the complaint must name
-    "no sequences": (lambda root: shutil.rmtree(root / "sequences"), "sequences/"),
-    "raw layout": (lambda root: (root / "sequences").rename(root / "2011_09_26_drive_0005_sync"), "raw data"),
+    "no sequences": (lambda root: shutil.rmtree(root / "sequences"), "a folder of *.bin or *.npy, and KITTI's odometry layout"),
+    "raw layout": (lambda root: (root / "sequences").rename(root / "2011_09_26_drive_0005_sync"), "kitti.py raw DRIVE ROOT"),
     "no scans": (lambda root: shutil.rmtree((root / SCAN).parent), "velodyne"),
     "a scan missing": (lambda root: (root / SCAN).with_name("000002.bin").unlink(), "000002.bin"),
     "a scan cut short": (rewrite(SCAN, lambda b: b[:-3]), SCAN),
