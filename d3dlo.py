@@ -280,8 +280,8 @@ def fingerprint(sequence):
     return digest.hexdigest()[:16]
 
 
-def _geometry_of_file(path, config):
-    scan = kitti.read_scan(path)
+def _geometry_of_file(path, config, intensity_max=1):
+    scan = kitti.read_scan(path, intensity_max)
     try:
         return scan_geometry(scan, config)
     except ValueError as error:
@@ -312,15 +312,17 @@ def load_geometry(sequences, config, cache="cache"):
     files = []
     for s in sequences:
         depends = (GEOMETRY, fingerprint(s), [p.stat().st_mtime_ns for p in s.scan_paths], dtype.descr, config.sa1.r, config.sa2.r,
-                   config.sa3.r, [(scale.r, scale.n_n) for scale in config.scales], config.spread, config.plane, config.max_range)
+                   config.sa3.r, [(scale.r, scale.n_n) for scale in config.scales], config.spread, config.plane, config.max_range, s.intensity_max)
         files.append(Path(cache) / f"{s.name}-{hashlib.sha256(repr(depends).encode()).hexdigest()[:16]}.npy")
     geometry = [_cached(file, dtype, len(s)) for s, file in zip(sequences, files)]
     missing = [(s, file) for s, file, records in zip(sequences, files, geometry) if records is None]
     if missing:
         paths = [path for s, _ in missing for path in s.scan_paths]
+        largest = [s.intensity_max for s, _ in missing for _ in s.scan_paths]
         pool = ProcessPoolExecutor(kitti.cores(), initializer=kitti.worker_starts)
         try:
-            records = pool.map(_geometry_of_file, paths, itertools.repeat(config), chunksize=4)
+            settings = itertools.repeat(config), largest
+            records = pool.map(_geometry_of_file, paths, *settings, chunksize=4)
             records = progress(records, len(paths), "sampling and grouping, scans")
             for s, file in missing:
                 shape = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": (len(s),)}
@@ -871,12 +873,39 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", checkpoint=None, say=
 BASELINES = "standing still", "mean motion of training"
 
 
-def run_network(net, state, s, records, out, device="cpu", refine=0):
-    """Register a sequence and write OUT/NN.txt, a KITTI pose file -> {predictor: (segment, step errors)}, empty without ground truth."""
-    strange = [words for words in (unlike(looks, state["seen"]) for looks in records["looks"]) if words]
+def warn_of_unlike(s, records, seen):
+    """Say on stderr how many scans of a sequence are unlike those in training, `seen`."""
+    strange = [words for words in (unlike(looks, seen) for looks in records["looks"]) if words]
     if strange:
         print(f"sequence {s.name}: {len(strange)} of {len(s)} scans are unlike those the weights were trained on, do not trust the answer: "
               f"{strange[0]}", file=sys.stderr)
+
+
+def run_folder(net, state, s, out, device="cpu", refine=0, plot=False, say=print):
+    """Register a `ScanFolder`. Write OUT/poses.txt and OUT/poses.tum in the LiDAR's frame; there is
+    no ground truth, so no error either."""
+    began = time.monotonic()
+    records, = load_geometry([s], net.config)
+    warn_of_unlike(s, records, state["seen"])
+    poses = accumulate(predict_motions(net, records, device, refine=refine))
+    speed = len(s) / (time.monotonic() - began)
+    metrics.write_poses(out / "poses.txt", poses)
+    metrics.write_tum(out / "poses.tum", poses, s.times)
+    say(f"{s.folder}: {len(s)} scans, {metrics.path_lengths(poses)[-1]:.1f} m, "
+        f"{speed:.1f} scans a second (faster where scans are cached)")
+    for note in s.notes:
+        say(f"Note: {note}.")
+    say("Poses are in the LiDAR's frame of the first scan: x forward, y left, z up, metres.\n"
+        f"trajectory    {out}/poses.txt (KITTI pose file)\n"
+        f"              {out}/poses.tum (t x y z qx qy qz qw, t in seconds)")
+    if plot:
+        metrics.draw(out / "plot.png", {s.name: (None, poses)})
+        say(f"picture       {out}/plot.png (from above)")
+
+
+def run_network(net, state, s, records, out, device="cpu", refine=0):
+    """Register a sequence and write OUT/NN.txt, a KITTI pose file -> {predictor: (segment, step errors)}, empty without ground truth."""
+    warn_of_unlike(s, records, state["seen"])
     motions, errors = predict_motions(net, records, device, refine=refine), {}
     constant = (np.broadcast_to(T, motions.shape) for T in (np.eye(4), from_vector(state["mean_motion"])))
     for predictor, T in zip(("network", *BASELINES), (motions, *constant)):
@@ -1006,6 +1035,9 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     sequences = sequences or ("all" if data else ("test", "validation"))
     root = data_root(data, sequences)
     chosen = kitti.open_sequences(root, sequences)
+    if isinstance(chosen[0], kitti.ScanFolder):
+        run_folder(net, state, chosen[0], out, device, refine, plot, say)
+        return out
     for s in chosen:
         if s.poses is None and (s.folder / "poses.txt").exists():
             print(f"{s.folder}/poses.txt: SemanticKITTI's, estimated by SuMa; not used, it is no ground truth", file=sys.stderr)
@@ -1022,7 +1054,7 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
         say(f"to submit     {out}/kitti-server.zip")
     if plot:
         metrics.draw(out / "plot.png", {s.name: (s.poses_cam, metrics.read_poses(out / f"{s.name}.txt")) for s in chosen})
-        say(f"picture       {out}/plot.png (from above in the camera's frame, errors by length)")
+        say(f"picture       {out}/plot.png (from above, errors by length)")
     return out
 
 
@@ -1085,11 +1117,15 @@ def command_line(argv):
         "  python d3dlo.py train --data ROOT --weights d3dlo.pt --short --lr 0.002\n"
         "  python d3dlo.py train --out RUN --resume"))
     e = commands.add_parser("eval", **how, help="trajectories and KITTI's errors", description=(
-        "Run D3DLO over sequences, write their trajectories, print KITTI's errors.\n\n  python d3dlo.py eval\n"
+        "Run D3DLO over sequences, write their trajectories, print KITTI's errors.\n"
+        "A plain folder of scans (*.bin or *.npy) gives a trajectory only.\n\n"
+        "  python d3dlo.py eval\n  python d3dlo.py eval --data FOLDER --plot\n"
         "  python d3dlo.py eval --data ROOT --sequences test\n  python d3dlo.py eval --data ROOT --weights RUN --sequences 11 12"))
     for command in (t, e):
         add = command.add_argument_group("data").add_argument
-        add("--data", metavar="ROOT", help=f"folder in KITTI odometry layout (default: a simulated city, made in {SIMULATED})")
+        layouts = "folder in KITTI odometry layout" + (", or of scans" if command is e else "")
+        add("--data", metavar="ROOT",
+            help=f"{layouts} (default: a simulated city, made in {SIMULATED})")
         add("--sequences", nargs="+", metavar="NN", help="names, or splits: train, test, validation, all")
 
     add = t.add_argument_group("network").add_argument

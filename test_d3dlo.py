@@ -972,6 +972,48 @@ def test_eval_writes_what_it_prints_and_metrics_agrees_and_zips_what_the_server_
             assert archive.read(name) == Path("out", name).read_bytes() and np.loadtxt(archive.open(name)).shape == (2, 12)
 
 
+@pytest.mark.parametrize("save, name, scale", [(save_bin, "{}.bin", 1), (np.save, "{}.npy", 255)])
+def test_eval_takes_a_plain_folder_of_scans(here, weights, capsys, save, name, scale):
+    scans = write_folder(here / "drive", size=1100, save=save, name=name, scale=scale)
+    arguments = ["eval", "--data", "drive", "--weights", str(weights), "--out"]
+    assert d3dlo.main([*arguments, "out"]) == 0
+    (out, err), (net, _) = capsys.readouterr(), load_weights(weights)
+    scans = [scan / np.float32([1, 1, 1, scale]) for scan in scans]
+    expected = d3dlo.accumulate([from_vector(predict(net, p, q)) for p, q in zip(scans, scans[1:])])
+    poses, rows = metrics.read_poses("out/poses.txt"), np.loadtxt("out/poses.tum")
+    assert sorted(os.listdir("out")) == ["poses.tum", "poses.txt"]
+    assert_allclose(poses, expected, rtol=1e-3, atol=1e-3)                          # not turned into a camera's frame
+    assert_allclose(rows[:, 0], np.arange(12) / 10)
+    assert_allclose(rows[:, 1:4], poses[:, :3, 3], atol=1e-6)
+    assert_allclose(Rotation.from_quat(rows[:, 4:]).as_matrix(), poses[:, :3, :3], atol=1e-6)
+    metres, speed = map(float, re.search(r"^drive: 12 scans, ([\d.]+) m, ([\d.]+) scans a second", out).groups())
+    assert metres == pytest.approx(metrics.path_lengths(poses)[-1], abs=0.06) and speed > 0
+    assert "LiDAR's frame" in out and "out/poses.txt" in out and "out/poses.tum" in out
+    assert complaint(err) == [] and "10 scans a second" in out and ("divided by 255" in out) == (scale > 1)
+    (here / "drive" / "times.txt").write_text("\n".join(f"{7 + i}" for i in range(12)))
+    assert d3dlo.main([*arguments, "again"]) == 0
+    assert_allclose(np.loadtxt("again/poses.tum"), rows + np.c_[7 + 0.9 * np.arange(12), np.zeros((12, 7))], atol=1e-8)
+    assert "10 scans" not in capsys.readouterr().out
+
+
+def test_a_plain_folder_is_drawn_where_there_is_matplotlib(here, weights, capsys):
+    pytest.importorskip("matplotlib")
+    write_folder(here / "drive", scans=3, size=1100)
+    assert d3dlo.main(["eval", "--data", "drive", "--weights", str(weights), "--out", "out", "--plot"]) == 0
+    assert (here / "out" / "plot.png").read_bytes().startswith(b"\x89PNG") and "out/plot.png" in capsys.readouterr().out
+
+
+def test_a_plain_folder_that_does_not_fit_is_named_in_one_line_and_leaves_nothing_behind(here, weights, capsys):
+    write_folder(here / "drive", size=1100)
+    before = files_of(here)
+    fails_with_one_line(d3dlo.main, ["train", "--data", "drive", "--out", "run"], "drive has no ground truth", capsys)
+    np.save(here / "drive" / "scan 2.npy", cloud(generator(0), 900))
+    fails_with_one_line(d3dlo.main, ["eval", "--data", "drive", "--weights", weights, "--out", "out"], "scan 2.npy: 900 usable", capsys)
+    five_floats(here / "drive", 52)
+    fails_with_one_line(d3dlo.main, ["eval", "--data", "drive", "--weights", weights, "--out", "out"], "nuScenes", capsys)
+    assert {name.split("/")[0] for name in files_of(here)} == {name.split("/")[0] for name in before} == {"drive"}
+
+
 def test_train_then_eval_then_train_again(here, city, capsys):
     arguments = ["train", "--data", shutil.copytree(city, "data"), "--epochs", "1", "--out", "run"]
     assert d3dlo.main(arguments) == 0
