@@ -6,6 +6,7 @@ in the Velodyne frame, because that is what the points are in: T_velo = inv(Tr) 
 
     python kitti.py simulate data/city      # an HDL-64E drives through 11 little cities, with exact ground truth: 2,620 scans, 4.2 GB
     python kitti.py simulate data/tiny --sequences 00 07 --scans 40 --azimuth 900
+    python kitti.py raw 2011_09_26/2011_09_26_drive_0013_sync data/raw      # a drive of KITTI's raw data, with ground truth
 """
 import argparse, functools, json, os, re, shutil, signal, sys, threading, time, warnings, zlib
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
@@ -15,7 +16,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from metrics import read_poses, temporary_beside, write_poses
+from metrics import path_lengths, read_poses, temporary_beside, write_poses
 
 SPLITS = {"train": ("00", "01", "02", "08", "09"), "test": ("03", "04", "05", "06", "10"), "validation": ("07",)}  # paper, section 4
 
@@ -78,17 +79,26 @@ def read_calib(path: str | Path) -> np.ndarray:
     get = "KITTI's is in data_odometry_calib.zip; for drives of your own write the line Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0"
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: {get}.")
-    rows = re.findall(rb"^\s*Tr\s*:(.*)$", path.read_bytes(), re.M)
-    try:
-        Tr = np.vstack([np.array(b"".join(rows[:1]).split(), dtype=float).reshape(3, 4), [0, 0, 0, 1]])  # (4,4)
-    except ValueError:  # no such row, or not of 12 numbers
-        Tr = np.full((4, 4), np.nan)
-    R = Tr[:3, :3]
-    with np.errstate(all="ignore"):  # of absurd numbers
-        right = np.isfinite(Tr).all() and np.abs(R @ R.T - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0
-    if not right:
+    row = _calib_row(path, "Tr", 12).reshape(3, 4)
+    if not _is_rigid(row):
         raise ValueError(f"{path} has no row 'Tr' (Velodyne to camera) of 12 finite numbers, a rotation and a translation: {get}.")
-    return Tr
+    return np.vstack([row, [0, 0, 0, 1]])  # (4,4)
+
+
+def _calib_row(path, name, count):
+    """The numbers of row `name` of a calibration file (count,), NaN without such a row of so many."""
+    rows = re.findall(rb"^\s*%s\s*:(.*)$" % name.encode(), path.read_bytes(), re.M)
+    try:
+        return np.array(rows[0].split(), dtype=float).reshape(count)
+    except (IndexError, ValueError):
+        return np.full(count, np.nan)
+
+
+def _is_rigid(row):
+    """Whether (3,4) are finite numbers, a rotation beside a translation."""
+    R = row[:, :3]
+    with np.errstate(all="ignore"):  # absurd numbers overflow
+        return bool(np.isfinite(row).all() and np.abs(R @ R.T - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0)
 
 
 # --------------------------------------------------------------------------------------------------------------- frames
@@ -358,6 +368,171 @@ def terminate_as_interrupted():
     """From here on SIGTERM is as Ctrl-C, which leaves through every `finally`."""
     if threading.current_thread() is threading.main_thread():  # Python's rule for signals
         signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+
+# --------------------------------------------------------------------------------------------------- KITTI's raw drives
+# Files and columns: readme.txt of the raw data development kit, and oxts/dataformat.txt of each drive.
+EARTH_RADIUS = 6378137.0  # m, devkit: latlonToMercator.m
+LAT_LON_ALT, ROLL_PITCH_YAW = slice(0, 3), slice(3, 6)  # columns of a packet: degrees, m; radians
+VELOCITY, TURN_RATE = [7, 6, 10], slice(17, 20)  # m/s east, north, up; rad/s around its x, y and z
+NEAR = np.timedelta64(100, "ms")  # without a packet as near as that a scan has no pose
+
+
+def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int]]:
+    """Convert an unpacked "sync" drive of KITTI's raw data to the odometry layout, with ground truth.
+
+    `drive` is a folder such as 2011_09_26/2011_09_26_drive_0013_sync, with the date's calib_*.txt in
+    its parent folder. Writes ROOT/sequences/2011_09_26_drive_0013/{velodyne, calib.txt, times.txt}
+    and ROOT/poses/2011_09_26_drive_0013.txt, in the rectified left camera's frame. Scans are hard
+    links where the file system allows it, else copies. A drive in which scans are missing is split
+    at the gaps, into sequences with -1, -2 ... behind their names. Returns the first and the last
+    scan number of each sequence.
+
+    A pose is that of the time in velodyne_points/timestamps.txt: the middle of the scanner's turn,
+    when it faces forward and triggers the cameras, which is what the "sync" data is aligned to. The
+    GPS/IMU packet of a scan was recorded at another time, 12 to 25 ms later in drive 0013. So the
+    nearest packet is moved by its own velocity and turn rate to the time of the scan. The points are
+    used as they are: those of a turn were measured over 0.1 s.
+
+    Raises FileNotFoundError for a missing file, naming its archive, and ValueError for a damaged one
+    or when ROOT holds such a sequence already. ROOT is then unchanged.
+    """
+    drive, root = Path(drive), Path(root)
+    name = re.fullmatch(r"((\d{4}_\d\d_\d\d)_drive_\d+)_sync", drive.resolve().name)
+    if not name:
+        raise ValueError(f"{drive} is no drive of KITTI's raw data: give a folder such as 2011_09_26/"
+                         "2011_09_26_drive_0013_sync, unpacked from the synced+rectified data.")
+    name, date = name.groups()
+    numbers, scans, times = _raw_stream(drive / "velodyne_points", ".bin", f"{name}_sync.zip")
+    _, packets, packet_times = _raw_stream(drive / "oxts", ".txt", f"{name}_sync.zip")
+    Tr, T_velo_imu = _raw_calib(drive.resolve().parent, f"{date}_calib.zip")
+    for path in scans:
+        _check_scan_size(path, path.stat().st_size)
+
+    # the nearest packet of each scan, then the scans in runs without a gap
+    nearest = np.array([np.abs(packet_times - time).argmin() for time in times])
+    late = times - packet_times[nearest]
+    has_pose = np.flatnonzero(np.abs(late) < NEAR)
+    if not len(has_pose):
+        raise ValueError(f"{drive}: no scan was taken within 0.1 s of a GPS/IMU packet; "
+                         f"unpack {name}_sync.zip again.")
+    runs = np.split(has_pose, np.flatnonzero(np.diff(numbers[has_pose]) != 1) + 1)
+    parts = {name if len(runs) == 1 else f"{name}-{i}": run for i, run in enumerate(runs, 1)}
+    packets = np.stack([_read_packet(path) for path in packets])  # (m,30)
+    T_imu = _imu_poses(packets, nearest, late / np.timedelta64(1, "s"))  # (n,4,4)
+
+    folders = {part: root / "sequences" / part for part in parts}
+    for folder in folders.values():
+        if folder.exists():
+            raise ValueError(f"{folder} is there already: remove it or choose another ROOT.")
+    temporary = {part: temporary_beside(folder) for part, folder in folders.items()}
+    try:
+        for part, run in parts.items():
+            _write_raw_sequence(temporary[part], [scans[i] for i in run], Tr, times[run])
+        for part, run in parts.items():
+            T = invert(T_imu[run[0]]) @ T_imu[run]
+            T_cam = velo_to_camera(T, Tr @ T_velo_imu)  # from the IMU's frame to the camera's
+            write_poses(root / "poses" / f"{part}.txt", T_cam)
+            temporary[part].rename(folders[part])
+    finally:
+        for folder in temporary.values():
+            shutil.rmtree(folder, ignore_errors=True)
+    return {part: (int(numbers[run[0]]), int(numbers[run[-1]])) for part, run in parts.items()}
+
+
+def _write_raw_sequence(folder, scans, Tr, times):
+    """The files of a sequence in odometry layout but its poses."""
+    shutil.rmtree(folder, ignore_errors=True)  # of an earlier process of the same number
+    (folder / "velodyne").mkdir(parents=True)
+    for i, scan in enumerate(progress(scans, len(scans), "linking or copying scans")):
+        target = folder / "velodyne" / f"{i:06d}.bin"
+        try:
+            os.link(scan.resolve(), target)
+        except OSError:  # another file system, or one without links
+            shutil.copyfile(scan, target)
+    seconds = (times - times[0]) / np.timedelta64(1, "s")
+    (folder / "calib.txt").write_text(f"Tr: {' '.join(f'{x:.12e}' for x in Tr[:3].ravel())}\n")
+    (folder / "times.txt").write_text("".join(f"{t:.6f}\n" for t in seconds))
+
+
+def _require(path, archive):
+    """Raises FileNotFoundError when a file of KITTI's is missing."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist: it is in {archive}.")
+
+
+def _raw_stream(folder, suffix, archive):
+    """The files of a stream that have a time: numbers (n,), paths (list), times (n,) datetime64[ns].
+
+    Line i of timestamps.txt, from 0, is the time of file i. It is blank where the recording has lost
+    a file, as some lines of drive 2011_09_26_drive_0009 are.
+    """
+    stamps = folder / "timestamps.txt"
+    paths = sorted(path for path in folder.glob(f"data/*{suffix}") if path.stem.isdecimal())
+    _require(stamps, archive)
+    _require(paths[0] if paths else folder / "data" / f"0000000000{suffix}", archive)
+    numbers = np.array([int(path.stem) for path in paths])
+    try:
+        lines = [line.strip() for line in stamps.read_text().splitlines()]
+        times = np.array(lines, "datetime64[ns]")[numbers]  # a blank line becomes NaT
+    except (ValueError, IndexError):
+        times = np.full(len(paths), np.datetime64("NaT"))
+    known = np.flatnonzero(~np.isnat(times))
+    if not len(known):
+        raise ValueError(f"{stamps} is damaged: line i should hold the time of file i, such as "
+                         f"2011-09-26 13:10:51.158069617; unpack {archive} again.")
+    return numbers[known], [paths[i] for i in known], times[known]
+
+
+def _read_packet(path):
+    """A GPS/IMU packet, (30,) numbers in the order of oxts/dataformat.txt."""
+    try:
+        packet = np.array(path.read_bytes().split(), dtype=float).reshape(30)
+    except ValueError:
+        packet = np.full(30, np.nan)
+    if not np.isfinite(packet).all():
+        raise ValueError(f"{path} is damaged: a GPS/IMU packet is 30 finite numbers; "
+                         "unpack the drive again.")
+    return packet
+
+
+def _raw_calib(folder, archive):
+    """The calib_*.txt of a date -> Tr (4,4) = T_cam0_velo, to the rectified camera, and T_velo_imu."""
+    def transform(name, rotation, translation=None):
+        path = folder / name
+        _require(path, archive)
+        t = _calib_row(path, translation, 3) if translation else np.zeros(3)
+        row = np.c_[_calib_row(path, rotation, 9).reshape(3, 3), t]
+        if not _is_rigid(row):
+            raise ValueError(f"{path} is damaged: its row {rotation!r} should hold a rotation, "
+                             f"and 'T' a translation; unpack {archive} again.")
+        return np.vstack([row, [0, 0, 0, 1]])
+    rectify = transform("calib_cam_to_cam.txt", "R_rect_00")
+    return (rectify @ transform("calib_velo_to_cam.txt", "R", "T"),
+            transform("calib_imu_to_velo.txt", "R", "T"))
+
+
+def _imu_poses(packets, nearest, late):
+    """Poses T_wi (n,4,4) of the GPS/IMU unit (x forward, y left, z up), `late` (n,) seconds after the
+    packets `nearest` (n,) of all (m,30). The world is x east, y north, z up, in metres.
+
+    The pose of a packet is that of the devkit's convertOxtsToPose.m: a Mercator projection with the
+    scale of the drive's first latitude, and roll, pitch, yaw about x, y, z in that order. Velocity and
+    turn rate are constant from there: the unit moves along an arc, and the chord of the arc has the
+    direction of the velocity half-way.
+    """
+    scale = EARTH_RADIUS * np.cos(np.radians(packets[0, 0]))
+    packets, late = packets[nearest], late[:, None]
+    lat, lon, alt = packets[:, LAT_LON_ALT].T
+    east, north = scale * np.radians(lon), scale * np.log(np.tan(np.radians(90 + lat) / 2))
+    position = np.stack([east, north, alt], axis=1)  # (n,3)
+    attitude = Rotation.from_euler("xyz", packets[:, ROLL_PITCH_YAW])
+    turn = attitude.apply(packets[:, TURN_RATE]) * late  # (n,3) rotation vectors in the world's axes
+    half_way = Rotation.from_rotvec(turn / 2)
+    T = np.tile(np.eye(4), (len(packets), 1, 1))
+    T[:, :3, :3] = (Rotation.from_rotvec(turn) * attitude).as_matrix()
+    T[:, :3, 3] = position + half_way.apply(packets[:, VELOCITY] * late)
+    return T
 
 
 # ---------------------------------------------------------------------------------------------------- the simulated city
@@ -824,17 +999,25 @@ def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range
 def main(argv=None):
     """The command line -> exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=["simulate"])
-    parser.add_argument("dir", metavar="DIR", help="where to")
-    parser.add_argument("--seed", type=int, metavar="N", default=0, help="another seed, other cities (default: 0)")
-    parser.add_argument("--sequences", nargs="+", metavar="NN", default=["all"], help="names, or train, test, validation, all (default)")
-    parser.add_argument("--scans", type=int, metavar="N", help="scans per sequence (default: 170 for test and validation, else 320)")
-    parser.add_argument("--azimuth", type=int, metavar="N", default=1800, help="rays per beam and turn (default: 1800)")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="simulate | raw")
+    s = commands.add_parser("simulate", help="make simulated drives, with ground truth")
+    s.add_argument("dir", metavar="DIR", help="where to")
+    s.add_argument("--seed", type=int, metavar="N", default=0, help="another seed, other cities (default: 0)")
+    s.add_argument("--sequences", nargs="+", metavar="NN", default=["all"], help="names, or train, test, validation, all (default)")
+    s.add_argument("--scans", type=int, metavar="N", help="scans per sequence (default: 170 for test and validation, else 320)")
+    s.add_argument("--azimuth", type=int, metavar="N", default=1800, help="rays per beam and turn (default: 1800)")
+    r = commands.add_parser("raw", help="convert a drive of KITTI's raw data, with ground truth from its GPS/IMU")
+    r.add_argument("drive", metavar="DRIVE", help="unpacked folder such as 2011_09_26/2011_09_26_drive_0013_sync")
+    r.add_argument("dir", metavar="ROOT", help="where to, in KITTI's odometry layout")
     args = parser.parse_args(argv)
     terminate_as_interrupted()
     try:
-        simulate(args.dir, args.seed, args.sequences, args.scans, args.azimuth)
-        made = open_sequences(args.dir, args.sequences)
+        if args.command == "raw":
+            parts = convert_raw(args.drive, args.dir)
+            made = open_sequences(args.dir, list(parts))
+        else:
+            simulate(args.dir, args.seed, args.sequences, args.scans, args.azimuth)
+            made = open_sequences(args.dir, args.sequences)
     except (ValueError, OSError, BrokenExecutor) as error:
         print(f"kitti.py: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
@@ -842,6 +1025,11 @@ def main(argv=None):
         print("kitti.py: interrupted; sequences that are complete stay, run the same command again for the rest.", file=sys.stderr)
         return 130
     print(f"{args.dir}: {len(made)} sequences, {sum(map(len, made)):,} scans")
+    if args.command == "raw":
+        for s, (first, last) in zip(made, parts.values()):
+            print(f"{s.name}: scans {first} to {last}, {path_lengths(s.poses)[-1]:.1f} m")
+        if len(made) > 1:
+            print("The drive is split where scans, or GPS/IMU packets within 0.1 s of them, are missing.")
     return 0
 
 

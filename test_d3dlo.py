@@ -1156,6 +1156,128 @@ def test_simulate_on_the_command_line(here, city, capsys):
     assert files_of(here) == before and not list(here.rglob(".*"))
 
 
+DRIVE = "2011_09_26/2011_09_26_drive_0013_sync"
+
+
+def imu_pose(t):
+    """Where the vehicle of `write_raw` is after t seconds: 12 m/s on a climbing bend, nose down and leaning, T_wi."""
+    yaw, radius = 0.4 + 0.3 * t, 12 / 0.3
+    position = [radius * np.sin(yaw), -radius * np.cos(yaw), 100 + 0.5 * t]         # east, north, up
+    return by_hand(np.r_[position, np.degrees([0.03, 0.05, yaw])])
+
+
+def write_raw(folder, scans=12):
+    """A drive in the layout of KITTI's raw data -> true poses (scans,4,4) of the rectified camera, in the first one's frame."""
+    rng, drive = generator(0), folder / DRIVE
+    times = {"velodyne_points": 0.1 * np.arange(scans) + rng.uniform(-0.004, 0.004, scans)}
+    times["oxts"] = times["velodyne_points"] + 0.015 + rng.uniform(-0.01, 0.01, scans)
+    for stream, seconds in times.items():
+        (drive / stream / "data").mkdir(parents=True)
+        stamps = np.datetime64("2011-09-26T23:59:59.5", "ns") + (1e9 * seconds).astype(int)     # midnight comes during the drive
+        (drive / stream / "timestamps.txt").write_text("".join(f"{stamp}\n".replace("T", " ") for stamp in stamps))
+    T_oxts = [imu_pose(t) for t in times["oxts"]]
+    scale = 6378137 * np.cos(np.radians(49))            # of the Mercator projection, at the first packet's latitude
+    for i, (t, T) in enumerate(zip(times["oxts"], T_oxts)):
+        cloud(rng, 40).tofile(drive / "velodyne_points" / "data" / f"{i:010d}.bin")
+        east, north, up = T[:3, 3] - T_oxts[0][:3, 3]
+        stretched = np.arctanh(np.sin(np.radians(49))) + north / scale
+        lat, lon, yaw = np.degrees(np.arcsin(np.tanh(stretched))), 8.4 + np.degrees(east / scale), 0.4 + 0.3 * t
+        packet = np.full(30, 77.0)                      # what is not used
+        packet[:11] = lat, lon, up, 0.03, 0.05, yaw, 12 * np.sin(yaw), 12 * np.cos(yaw), 77, 77, 0.5
+        packet[17:20] = T[:3, :3].T @ [0, 0, 0.3]       # the vehicle's own axes
+        (drive / "oxts" / "data" / f"{i:010d}.txt").write_text(" ".join(map(repr, packet.tolist())))
+    T_velo_imu, T_cam_velo, rectify = motion(rng), by_hand(np.array([0, -0.1, -0.3, -90, 1, -91])), by_hand(np.array([0, 0, 0, 1, 2, 3.0]))
+    write = lambda *numbers: " ".join(map(repr, np.concatenate(numbers, axis=None).tolist()))
+    for name, T in ("imu_to_velo", T_velo_imu), ("velo_to_cam", T_cam_velo):
+        (drive.parent / f"calib_{name}.txt").write_text(f"calib_time: 25-May-2012\nR: {write(T[:3, :3])}\nT: {write(T[:3, 3])}\n")
+    (drive.parent / "calib_cam_to_cam.txt").write_text(f"R_00: {write(np.eye(3))}\nR_rect_00: {write(rectify[:3, :3])}\n")
+    T_wc = [imu_pose(t) @ np.linalg.inv(rectify @ T_cam_velo @ T_velo_imu) for t in times["velodyne_points"]]
+    return np.linalg.inv(T_wc[0]) @ T_wc, rectify @ T_cam_velo
+
+
+def test_a_raw_drive_is_converted_with_poses_of_the_time_of_its_scans(here, capsys):
+    truth, Tr = write_raw(here)
+    assert kitti.main(["raw", DRIVE, "root"]) == 0
+    out, err = capsys.readouterr()
+    s, = kitti.open_sequences("root")
+    assert s.name == "2011_09_26_drive_0013" and complaint(err) == [] and "root: 1 sequences, 12 scans" in out and "split" not in out
+    assert re.search(r"scans 0 to 11, 13\.\d m", out)   # 1.1 s at 12 m/s
+    assert_allclose(s.Tr, Tr, atol=1e-9)
+    assert_allclose(s.poses_cam, truth, atol=1e-3)      # 1 mm
+    assert metrics.step_errors(truth, s.poses_cam).max() < 1e-3
+    assert_allclose(np.loadtxt("root/sequences/2011_09_26_drive_0013/times.txt"), 0.1 * np.arange(12), atol=0.01)
+    for scan, path in zip(sorted((here / DRIVE).rglob("*.bin")), s.scan_paths, strict=True):
+        assert path.samefile(scan)                      # takes no room
+    before = files_of(here)
+    fails_with_one_line(kitti.main, ["raw", DRIVE, "root"], "2011_09_26_drive_0013 is there already", capsys)
+    assert files_of(here) == before
+
+
+def test_scans_of_a_raw_drive_are_copied_where_they_cannot_be_linked(here, monkeypatch):
+    write_raw(here)
+    before = files_of(DRIVE)
+    monkeypatch.setattr(os, "link", lambda *paths: os.rmdir("/no such folder"))     # OSError, as from one disk to another
+    assert kitti.convert_raw(DRIVE, "root") == {"2011_09_26_drive_0013": (0, 11)}
+    s, = kitti.open_sequences("root")
+    assert [path.read_bytes() for path in s.scan_paths] == [before[f"velodyne_points/data/{i:010d}.bin"] for i in range(12)]
+    assert files_of(DRIVE) == before
+
+
+def without_line(path, i):
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:i], "", *lines[i + 1:]]))
+
+
+@table("spoil, parts", {       # how a gap comes about, and the first and last scan of each sequence that is left
+    "scans are missing": (lambda drive: [(drive / "velodyne_points" / "data" / f"{i:010d}.bin").unlink() for i in (3, 4)], [(0, 2), (5, 11)]),
+    "a time is missing": (lambda drive: without_line(drive / "velodyne_points" / "timestamps.txt", 7), [(0, 6), (8, 11)]),
+    "packets are missing": (lambda drive: [(drive / "oxts" / "data" / f"{i:010d}.txt").unlink() for i in (4, 5, 6)], [(0, 4), (7, 11)]),
+    "times of packets are missing": (lambda drive: [without_line(drive / "oxts" / "timestamps.txt", i) for i in (4, 5, 6)], [(0, 4), (7, 11)]),
+})
+def test_a_raw_drive_is_split_where_something_is_missing_and_that_is_said(here, capsys, spoil, parts):
+    truth, _ = write_raw(here)
+    spoil(here / DRIVE)
+    assert kitti.main(["raw", DRIVE, "root"]) == 0
+    out, sequences = capsys.readouterr().out, kitti.open_sequences("root")
+    assert "split" in out and [s.name for s in sequences] == ["2011_09_26_drive_0013-1", "2011_09_26_drive_0013-2"]
+    for s, (first, last) in zip(sequences, parts, strict=True):
+        assert f"{s.name}: scans {first} to {last}" in out
+        assert_allclose(s.poses_cam, np.linalg.inv(truth[first]) @ truth[first:last + 1], atol=1e-3)
+        assert (s.scan_paths[-1]).samefile(f"{DRIVE}/velodyne_points/data/{last:010d}.bin")
+
+
+@table("spoil, words", {       # what is done to a good drive, and what the complaint must name
+    **{f"no {name}": (lambda drive, name=name: (drive.parent / name).unlink(), (name, "2011_09_26_calib.zip"))
+       for name in ("calib_imu_to_velo.txt", "calib_velo_to_cam.txt", "calib_cam_to_cam.txt")},
+    **{f"no {name}": (lambda drive, name=name: (drive / name).unlink(), (name, "2011_09_26_drive_0013_sync.zip"))
+       for name in ("oxts/timestamps.txt", "velodyne_points/timestamps.txt")},
+    "no packets": (lambda drive: shutil.rmtree(drive / "oxts" / "data"), ("oxts/data/0000000000.txt", "2011_09_26_drive_0013_sync.zip")),
+    "no scans": (lambda drive: shutil.rmtree(drive / "velodyne_points" / "data"), ("data/0000000000.bin", "2011_09_26_drive_0013_sync.zip")),
+    "no drive": (shutil.rmtree, ("velodyne_points/timestamps.txt", "2011_09_26_drive_0013_sync.zip")),
+    "too few times": (lambda drive: (drive / "oxts" / "timestamps.txt").write_text("2011-09-26 13:10:51.1\n"), ("oxts/timestamps.txt",)),
+    "times in other words": (lambda drive: (drive / "oxts" / "timestamps.txt").write_text("noon\n" * 12), ("oxts/timestamps.txt",)),
+    "no times": (lambda drive: (drive / "velodyne_points" / "timestamps.txt").write_text("\n" * 12), ("velodyne_points/timestamps.txt",)),
+    "another day": (lambda drive: (drive / "oxts" / "timestamps.txt").write_text("2011-09-28 13:10:51.1\n" * 12), (DRIVE, "within 0.1 s")),
+    "a packet of 29": (rewrite("oxts/data/0000000005.txt", lambda b: b.rpartition(b" ")[0]), ("oxts/data/0000000005.txt", "30")),
+    "a packet not finite": (rewrite("oxts/data/0000000005.txt", lambda b: b"nan" + b[b.index(b" "):]), ("oxts/data/0000000005.txt", "30")),
+    "a scan cut short": (rewrite("velodyne_points/data/0000000007.bin", lambda b: b[:-1]), ("0000000007.bin",)),
+    "no rotation": (rewrite("../calib_velo_to_cam.txt", lambda b: b.replace(b"R:", b"S:")), ("calib_velo_to_cam.txt", "2011_09_26_calib.zip")),
+    "no translation": (rewrite("../calib_imu_to_velo.txt", lambda b: b.replace(b"T:", b"U:")), ("calib_imu_to_velo.txt",)),
+})
+def test_a_raw_drive_that_is_incomplete_or_damaged_is_named_in_one_line_and_leaves_nothing_behind(here, capsys, spoil, words):
+    write_raw(here)
+    spoil(here / DRIVE)
+    code, err = kitti.main(["raw", DRIVE, "root"]), capsys.readouterr().err
+    assert code == 2 and len(complaint(err)) == 1 and all(word in err for word in words) and "Traceback" not in err, err
+    assert not (here / "root").exists()
+
+
+def test_a_folder_that_is_no_raw_drive_is_named_in_one_line(here, capsys):
+    for name in ("gone", ".", "2011_09_26_drive_0013_extract"):
+        fails_with_one_line(kitti.main, ["raw", name, "root"], f"{name} is no drive of KITTI's raw data", capsys)
+    assert not any(here.iterdir())
+
+
 def test_as_a_user_sees_it_in_a_read_only_place_of_foreign_letters_with_no_home_and_spawned_workers(tmp_path, weights):
     here = tmp_path / "o\u00f9 \u00e7a \u6f22"
 
