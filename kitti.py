@@ -6,7 +6,7 @@ in the Velodyne frame, because that is what the points are in: T_velo = inv(Tr) 
 
     python kitti.py simulate data/city      # an HDL-64E drives through 11 little cities, with exact ground truth: 2,620 scans, 4.2 GB
     python kitti.py simulate data/tiny --sequences 00 07 --scans 40 --azimuth 900
-    python kitti.py raw 2011_09_26/2011_09_26_drive_0013_sync data/raw      # a drive of KITTI's raw data, with ground truth
+    python kitti.py raw DRIVE data/raw      # a drive of KITTI's raw data, with ground truth
 """
 import argparse, functools, json, os, re, shutil, signal, sys, threading, time, warnings, zlib
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
@@ -36,10 +36,10 @@ def _check_scan_size(path, size):
 def read_scan(path: str | Path, intensity_max: float = 1) -> np.ndarray:
     """Read one scan, a .bin or .npy file.
 
-    Returns (N,4) float32: x, y, z [m] in the LiDAR's frame, and intensity divided by `intensity_max`.
-    NaN is kept. A .bin file holds four float32 per point, as KITTI's. A .npy file holds an array
-    (N,3) or (N,4); without a fourth column the intensities are 0. Raises OSError when the file cannot
-    be read, ValueError when it is empty, damaged or of another format.
+    Returns (N,4) float32: x, y, z [m] in the LiDAR's frame, and the intensity divided by
+    `intensity_max`. NaN is kept. A .bin file holds four float32 per point, as KITTI's. A .npy file
+    holds an array (N,3) or (N,4); without a fourth column the intensities are 0. Raises OSError
+    when the file cannot be read, ValueError when it is empty, damaged or of another format.
     """
     path = Path(path)
     scan = _read_npy(path) if path.suffix == ".npy" else _read_bin(path)
@@ -61,11 +61,11 @@ def _read_npy(path):
     except OSError:
         raise
     except Exception:  # np.load raises many exception types; all of them mean a corrupt file
-        raise ValueError(f"{path} is no NumPy file, or a damaged one: save the scan again.") from None
+        raise ValueError(f"{path} is no NumPy file or is damaged: save the scan again.") from None
     shape = getattr(points, "shape", ())  # an archive of several arrays has none
     if len(shape) != 2 or shape[0] == 0 or shape[1] not in (3, 4) or points.dtype.kind not in "fiu":
-        raise ValueError(f"{path} has shape {shape}, but a scan is an array of numbers (N,3) or (N,4): "
-                         "save the columns x, y, z and intensity.")
+        raise ValueError(f"{path} has shape {shape}, but a scan is an array of numbers (N,3) or "
+                         "(N,4): save the columns x, y, z and intensity.")
     scan = np.zeros((len(points), 4), np.float32)
     with np.errstate(over="ignore"):  # numbers too large for float32 become infinite
         scan[:, :points.shape[1]] = points
@@ -86,7 +86,7 @@ def read_calib(path: str | Path) -> np.ndarray:
 
 
 def _calib_row(path, name, count):
-    """The numbers of row `name` of a calibration file (count,), NaN without such a row of so many."""
+    """Row `name` of a calibration file: (count,) numbers, all NaN when there is no such row."""
     rows = re.findall(rb"^\s*%s\s*:(.*)$" % name.encode(), path.read_bytes(), re.M)
     try:
         return np.array(rows[0].split(), dtype=float).reshape(count)
@@ -95,10 +95,11 @@ def _calib_row(path, name, count):
 
 
 def _is_rigid(row):
-    """Whether (3,4) are finite numbers, a rotation beside a translation."""
+    """Whether (3,4) is finite, with a rotation in its first three columns."""
     R = row[:, :3]
     with np.errstate(all="ignore"):  # absurd numbers overflow
-        return bool(np.isfinite(row).all() and np.abs(R @ R.T - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0)
+        rotation = np.abs(R @ R.T - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0
+    return bool(np.isfinite(row).all() and rotation)
 
 
 # --------------------------------------------------------------------------------------------------------------- frames
@@ -185,19 +186,19 @@ class Sequence:
         """(n-1,4,4) T_{t,t+1} = inv(T_t) @ T_{t+1} (paper eq. 1) in the Velodyne frame: maps points of scan t+1 into scan t.
         Raises ValueError when the sequence has no ground truth."""
         if self.poses is None:
-            raise ValueError(f"Sequence {self.name} has no ground truth: put it into ROOT/poses/{self.name}.txt beside ROOT/sequences "
-                             f"(SemanticKITTI's sequences/{self.name}/poses.txt is no truth, SuMa estimated it).")
+            raise ValueError(f"Sequence {self.name} has no ground truth: put it into ROOT/poses/"
+                             f"{self.name}.txt beside ROOT/sequences (SemanticKITTI's sequences/"
+                             f"{self.name}/poses.txt is no truth, SuMa estimated it).")
         return invert(self.poses[:-1]) @ self.poses[1:]
 
 
 class ScanFolder(Sequence):
     """A plain folder of scans as a sequence: *.bin or *.npy, in natural order (2 before 10).
 
-    name is the folder's. There is no calibration and no ground truth, so Tr, poses_cam and poses are
-    None and poses are in the LiDAR's frame. intensity_max is what intensities are divided by, 1 or
-    255. times (n,) are the seconds in the folder's times.txt, or else those of 10 scans a second.
-    notes is a list of lines that say what was assumed. Raises ValueError when the files do not fit
-    together or are no scans.
+    name is the folder's. There is no calibration and no ground truth: Tr, poses_cam and poses are
+    None. intensity_max is what intensities are divided by, 1 or 255. times (n,) are the seconds in
+    the folder's times.txt, or else those of 10 scans a second. notes is a list of lines that say
+    what was assumed. Raises ValueError when the files do not fit together or are no scans.
     """
 
     def __init__(self, folder):
@@ -227,39 +228,41 @@ class ScanFolder(Sequence):
 def scans_in(folder):
     """The *.bin and *.npy files of a folder, in natural order: list of paths."""
     paths = [path for path in Path(folder).glob("[!.]*") if path.suffix in (".bin", ".npy")]
-    return sorted(paths, key=lambda path: re.sub(r"\d+", lambda digits: digits[0].zfill(20), path.name))
+    pad = lambda digits: digits[0].zfill(20)
+    return sorted(paths, key=lambda path: re.sub(r"\d+", pad, path.name))
 
 
 def _largest_intensity(paths):
-    """The largest intensity of ten scans spread over a folder. Raises ValueError if it cannot be one."""
+    """The largest intensity of ten scans spread over a folder; ValueError if it cannot be one."""
     largest = 0
     for i in np.unique(np.linspace(0, len(paths) - 1, 10).astype(int)):
         intensity = read_scan(paths[i])[:, 3]
         intensity = intensity[np.isfinite(intensity)]
         if intensity.min(initial=0) < 0:
-            raise ValueError(f"{paths[i]}: the fourth value of a point is {intensity.min():.4g}, but an intensity is "
-                             f"not negative, so these are not x, y, z, intensity. {FIVE_FLOATS}.")
+            raise ValueError(f"{paths[i]}: the fourth value of a point is {intensity.min():.4g}, "
+                             "but no intensity is negative, so these are not x, y, z, intensity. "
+                             f"{FIVE_FLOATS}.")
         if intensity.max(initial=0) > 255:
-            raise ValueError(f"{paths[i]} has intensities up to {intensity.max():.4g}, but they must lie within "
-                             "0..1 or 0..255: rescale those of all scans.")
+            raise ValueError(f"{paths[i]} has intensities up to {intensity.max():.4g}, but they "
+                             "must lie within 0..1 or 0..255: rescale those of all scans.")
         largest = max(largest, intensity.max(initial=0))
     return largest
 
 
 def _read_times(path, n):
-    """(n,) seconds, one per line and increasing. Raises ValueError when the file holds anything else."""
+    """(n,) seconds, one per line and increasing; ValueError when the file holds anything else."""
     try:
         times = np.array(path.read_bytes().split(), dtype=float)
     except ValueError:
         times = np.empty(0)
     if len(times) != n or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-        raise ValueError(f"{path} must hold {n} increasing numbers, the time of each scan in seconds: "
-                         "correct it, or remove it to assume 10 scans a second.")
+        raise ValueError(f"{path} must hold {n} increasing numbers, the time of each scan in "
+                         "seconds: correct it, or remove it to assume 10 scans a second.")
     return times
 
 
 def sequence_names(root: str | Path) -> list[str]:
-    """The sequences of ROOT that have scans; a plain folder of scans is one, with the folder's name.
+    """The sequences of ROOT that have scans; a plain folder of scans is one, with its name.
     Raises FileNotFoundError when there are none, as in an unknown layout."""
     root = Path(root)
     if not (root / "sequences").exists() and scans_in(root):
@@ -267,17 +270,21 @@ def sequence_names(root: str | Path) -> list[str]:
     there = sorted(p.parent.name for p in root.glob("sequences/[!.]*/velodyne") if next(p.glob("*.bin"), None))
     if not there:
         raw = any(re.search(r"_drive_\d+|^velodyne_points$", p.name) for p in (root, *root.glob("*"), *root.glob("*/*")))
-        hint = "it looks like KITTI raw data, convert that with `python kitti.py raw DRIVE ROOT`. " if raw else ""
+        remedy = "check the path and unpack its archives"
+        if raw:
+            remedy = "convert KITTI's raw data with `python kitti.py raw DRIVE ROOT`"
         raise FileNotFoundError(
-            f"{root} has no scans in a known layout: {hint}Known are a folder of *.bin or *.npy, and KITTI's odometry "
-            "layout, ROOT/sequences/00/{velodyne/000000.bin, calib.txt} and ROOT/poses/00.txt.")
+            f"{root} has no scans in a known layout: {remedy}. Known are a folder of *.bin or *.npy "
+            "files, and KITTI's odometry layout, ROOT/sequences/00/{velodyne/000000.bin, calib.txt} "
+            "and ROOT/poses/00.txt.")
     return there
 
 
 def open_sequences(root: str | Path, names: str | list[str] | None = None) -> list[Sequence]:
     """ROOT and names -> list of `Sequence`, in the order given, each once. A name is a folder under ROOT/sequences, a split of SPLITS (as
-    much of it as there is) or 'all'; None is 'all'. A ROOT without sequences/ is one `ScanFolder`. Raises ValueError for an unknown name or
-    a split of which nothing is there, and whatever `sequence_names`, `Sequence` and `ScanFolder` raise."""
+    much of it as there is) or 'all'; None is 'all'. A ROOT without sequences/ is one `ScanFolder`.
+    Raises ValueError for an unknown name or a split of which nothing is there, and whatever
+    `sequence_names`, `Sequence` and `ScanFolder` raise."""
     there = sequence_names(root)
     choices = {split: [n for n in part if n in there] for split, part in SPLITS.items()} | {"all": there} | {n: [n] for n in there}
     names = ["all"] if names is None else [names] if isinstance(names, str) else list(names)
@@ -370,8 +377,8 @@ def terminate_as_interrupted():
         signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
-# --------------------------------------------------------------------------------------------------- KITTI's raw drives
-# Files and columns: readme.txt of the raw data development kit, and oxts/dataformat.txt of each drive.
+# ------------------------------------------------------------------------------ KITTI's raw drives
+# Files and columns: readme.txt of the raw data devkit, and oxts/dataformat.txt of each drive.
 EARTH_RADIUS = 6378137.0  # m, devkit: latlonToMercator.m
 LAT_LON_ALT, ROLL_PITCH_YAW = slice(0, 3), slice(3, 6)  # columns of a packet: degrees, m; radians
 VELOCITY, TURN_RATE = [7, 6, 10], slice(17, 20)  # m/s east, north, up; rad/s around its x, y and z
@@ -379,29 +386,29 @@ NEAR = np.timedelta64(100, "ms")  # without a packet as near as that a scan has 
 
 
 def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int]]:
-    """Convert an unpacked "sync" drive of KITTI's raw data to the odometry layout, with ground truth.
+    """Convert an unpacked "sync" drive of KITTI's raw data to odometry layout, with ground truth.
 
-    `drive` is a folder such as 2011_09_26/2011_09_26_drive_0013_sync, with the date's calib_*.txt in
-    its parent folder. Writes ROOT/sequences/2011_09_26_drive_0013/{velodyne, calib.txt, times.txt}
-    and ROOT/poses/2011_09_26_drive_0013.txt, in the rectified left camera's frame. Scans are hard
+    `drive` is a folder such as 2011_09_26/2011_09_26_drive_0013_sync, with the date's calib_*.txt
+    in its parent folder. Writes the folder ROOT/sequences/2011_09_26_drive_0013 and the ground
+    truth ROOT/poses/2011_09_26_drive_0013.txt, in the rectified left camera's frame. Scans are hard
     links where the file system allows it, else copies. A drive in which scans are missing is split
-    at the gaps, into sequences with -1, -2 ... behind their names. Returns the first and the last
-    scan number of each sequence.
+    at the gaps, into sequences with -1, -2 ... behind their names. Returns {name of a sequence:
+    (number of its first scan in the drive, of its last)}.
 
     A pose is that of the time in velodyne_points/timestamps.txt: the middle of the scanner's turn,
     when it faces forward and triggers the cameras, which is what the "sync" data is aligned to. The
     GPS/IMU packet of a scan was recorded at another time, 12 to 25 ms later in drive 0013. So the
-    nearest packet is moved by its own velocity and turn rate to the time of the scan. The points are
-    used as they are: those of a turn were measured over 0.1 s.
+    nearest packet is moved by its own velocity and turn rate to the time of the scan. The points
+    are used as they are: those of a turn were measured over 0.1 s.
 
-    Raises FileNotFoundError for a missing file, naming its archive, and ValueError for a damaged one
-    or when ROOT holds such a sequence already. ROOT is then unchanged.
+    Raises FileNotFoundError for a missing file, naming its archive, and ValueError for a damaged
+    one or when ROOT holds such a sequence already. ROOT is then unchanged.
     """
     drive, root = Path(drive), Path(root)
     name = re.fullmatch(r"((\d{4}_\d\d_\d\d)_drive_\d+)_sync", drive.resolve().name)
     if not name:
-        raise ValueError(f"{drive} is no drive of KITTI's raw data: give a folder such as 2011_09_26/"
-                         "2011_09_26_drive_0013_sync, unpacked from the synced+rectified data.")
+        raise ValueError(f"{drive} is no drive of KITTI's raw data: give a folder such as "
+                         "2011_09_26/2011_09_26_drive_0013_sync, of the synced+rectified data.")
     name, date = name.groups()
     numbers, scans, times = _raw_stream(drive / "velodyne_points", ".bin", f"{name}_sync.zip")
     _, packets, packet_times = _raw_stream(drive / "oxts", ".txt", f"{name}_sync.zip")
@@ -462,10 +469,10 @@ def _require(path, archive):
 
 
 def _raw_stream(folder, suffix, archive):
-    """The files of a stream that have a time: numbers (n,), paths (list), times (n,) datetime64[ns].
+    """The files of a stream that have a time: numbers (n,), paths (list), times (n,).
 
-    Line i of timestamps.txt, from 0, is the time of file i. It is blank where the recording has lost
-    a file, as some lines of drive 2011_09_26_drive_0009 are.
+    Line i of timestamps.txt, from 0, is the time of file i, to the nanosecond. It is blank where
+    the recording has lost a file, as in drive 2011_09_26_drive_0009.
     """
     stamps = folder / "timestamps.txt"
     paths = sorted(path for path in folder.glob(f"data/*{suffix}") if path.stem.isdecimal())
@@ -497,7 +504,7 @@ def _read_packet(path):
 
 
 def _raw_calib(folder, archive):
-    """The calib_*.txt of a date -> Tr (4,4) = T_cam0_velo, to the rectified camera, and T_velo_imu."""
+    """The calib_*.txt of a date -> Tr (4,4), from Velodyne to rectified camera, and T_velo_imu."""
     def transform(name, rotation, translation=None):
         path = folder / name
         _require(path, archive)
@@ -513,13 +520,13 @@ def _raw_calib(folder, archive):
 
 
 def _imu_poses(packets, nearest, late):
-    """Poses T_wi (n,4,4) of the GPS/IMU unit (x forward, y left, z up), `late` (n,) seconds after the
-    packets `nearest` (n,) of all (m,30). The world is x east, y north, z up, in metres.
+    """Poses T_wi (n,4,4) of the GPS/IMU unit (x forward, y left, z up), `late` (n,) seconds after
+    the packets `nearest` (n,) of all (m,30). The world is x east, y north, z up, in metres.
 
-    The pose of a packet is that of the devkit's convertOxtsToPose.m: a Mercator projection with the
-    scale of the drive's first latitude, and roll, pitch, yaw about x, y, z in that order. Velocity and
-    turn rate are constant from there: the unit moves along an arc, and the chord of the arc has the
-    direction of the velocity half-way.
+    The pose of a packet is that of the devkit's convertOxtsToPose.m: a Mercator projection with
+    the scale of the drive's first latitude, and roll, pitch, yaw about x, y, z in that order.
+    Velocity and turn rate are constant from there: the unit moves along an arc, and the chord of
+    the arc has the direction of the velocity half-way.
     """
     scale = EARTH_RADIUS * np.cos(np.radians(packets[0, 0]))
     packets, late = packets[nearest], late[:, None]
@@ -527,7 +534,7 @@ def _imu_poses(packets, nearest, late):
     east, north = scale * np.radians(lon), scale * np.log(np.tan(np.radians(90 + lat) / 2))
     position = np.stack([east, north, alt], axis=1)  # (n,3)
     attitude = Rotation.from_euler("xyz", packets[:, ROLL_PITCH_YAW])
-    turn = attitude.apply(packets[:, TURN_RATE]) * late  # (n,3) rotation vectors in the world's axes
+    turn = attitude.apply(packets[:, TURN_RATE]) * late  # (n,3) rotation vectors, world's axes
     half_way = Rotation.from_rotvec(turn / 2)
     T = np.tile(np.eye(4), (len(packets), 1, 1))
     T[:, :3, :3] = (Rotation.from_rotvec(turn) * attitude).as_matrix()
@@ -1006,8 +1013,9 @@ def main(argv=None):
     s.add_argument("--sequences", nargs="+", metavar="NN", default=["all"], help="names, or train, test, validation, all (default)")
     s.add_argument("--scans", type=int, metavar="N", help="scans per sequence (default: 170 for test and validation, else 320)")
     s.add_argument("--azimuth", type=int, metavar="N", default=1800, help="rays per beam and turn (default: 1800)")
-    r = commands.add_parser("raw", help="convert a drive of KITTI's raw data, with ground truth from its GPS/IMU")
-    r.add_argument("drive", metavar="DRIVE", help="unpacked folder such as 2011_09_26/2011_09_26_drive_0013_sync")
+    r = commands.add_parser("raw", help="convert a drive of KITTI's raw data, with ground truth")
+    r.add_argument("drive", metavar="DRIVE",
+                   help="unpacked folder such as 2011_09_26/2011_09_26_drive_0013_sync")
     r.add_argument("dir", metavar="ROOT", help="where to, in KITTI's odometry layout")
     args = parser.parse_args(argv)
     terminate_as_interrupted()
@@ -1029,7 +1037,7 @@ def main(argv=None):
         for s, (first, last) in zip(made, parts.values()):
             print(f"{s.name}: scans {first} to {last}, {path_lengths(s.poses)[-1]:.1f} m")
         if len(made) > 1:
-            print("The drive is split where scans, or GPS/IMU packets within 0.1 s of them, are missing.")
+            print("The drive is split where scans or their GPS/IMU packets are missing.")
     return 0
 
 

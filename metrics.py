@@ -206,9 +206,9 @@ def picture(width, height):
 def view_from_above(T: np.ndarray) -> tuple[np.ndarray, str, str]:
     """How to draw poses (n,4,4) from above: a matrix (2,3) and the labels of the two axes.
 
-    The matrix maps positions to metres right and forward, as seen in the first frame. The mean step,
-    each step in its own frame, tells the frame: a vehicle moves along z in a camera's frame (x right,
-    y down, z forward) and along x in a LiDAR's (x forward, y left, z up). Without any motion the frame
+    The matrix maps positions to metres right and forward. The frame is found from the mean step,
+    each step in its own frame: a vehicle moves along z in a camera's frame (x right, y down,
+    z forward) and along x in a LiDAR's (x forward, y left, z up). Without any motion the frame
     is taken to be the camera's, as in KITTI's pose files.
     """
     steps = np.linalg.inv(T[:-1]) @ T[1:]
@@ -233,7 +233,8 @@ def draw(path, trajectories):
             if T is not None:
                 above.plot(*view @ T[:, :3, 3].T, **style)
         above.plot(0, 0, "ko", ms=5)
-        above.set(title=f"{name} from above, from the dot", xlabel=right, ylabel=forward, aspect="equal", adjustable="datalim")
+        above.set(title=f"{name} from above, from the dot", xlabel=right, ylabel=forward,
+                  aspect="equal", adjustable="datalim")
         above.legend(frameon=False)
         lengths = by_length([] if T_gt is None else [segment_errors(T_gt, T_est)])
         for axis, error, unit in zip(errors, ("E_t", "E_r"), ("%", "deg/m")):
