@@ -121,7 +121,7 @@ def check_config(config):
     sa1, fe, sa2, sa3, mlp = config.sa1, config.fe, config.sa2, config.sa3, config.mlp.mlp
     widths = [sa1.mlp, fe.mlp, sa2.mlp, sa3.mlp, config.mpn.mlp, mlp]
     require(all(positive(sa.r) for sa in (sa1, sa2, sa3)), "every radius must be positive")
-    require(all(whole(sa.n_fps, 65535) for sa in (sa1, sa2, sa3)), "n_fps must be 1 to 65,535")  # u2
+    require(all(whole(sa.n_fps, 65535) for sa in (sa1, sa2, sa3)), "n_fps must be 1 to 65,535")
     require(sa1.n_fps >= sa2.n_fps >= sa3.n_fps, "n_fps must not grow from layer to layer")
     require(all(whole(x.n_n, 1024) for x in (sa1, fe, sa2, sa3)), "n_n must be 1 to 1,024")
     require(all(len(w) > 1 and all(map(whole, w)) for w in widths), "an MLP has 2 layers at least")
@@ -150,7 +150,7 @@ def fps_textbook(xyz, n, start=0):
     """Farthest point sampling: each new centroid is the point farthest from all centroids so far.
 
     xyz (N,3), index of the first centroid -> indices (n,) of the centroids. Ties go to the lowest
-    index. `farthest_point_sampling` in part 7 returns the same indices, faster, and is used instead.
+    index. `farthest_point_sampling` in part 7 returns the same indices faster, so it is used.
     """
     centroids = np.empty(n, np.int64)
     centroids[0] = start
@@ -822,16 +822,21 @@ def load_geometry(sequences, config, cache="cache"):
 GEOMETRY = 4  # increase it when `scan_geometry` changes, so that old caches are not read
 
 
+def warn_about_shift(s, records, seen):
+    """Say on stderr how many scans of a sequence are unlike those of the training."""
+    shifts = [kitti.domain_shift(stats, seen) for stats in records["stats"]]
+    if any(shifts):
+        print(f"sequence {s.name}: {sum(map(bool, shifts))} of {len(s)} scans are unlike those the "
+              f"weights were trained on, the poses may be wrong: {next(filter(None, shifts))}",
+              file=sys.stderr)
+
+
 def evaluate_sequence(net, state, s, records, out, device="cpu", refine=0):
     """Predict the trajectory of a sequence and write OUT/NN.txt, a KITTI pose file.
 
     Returns {predictor: (segment errors, step errors)}, empty without ground truth.
     """
-    shifts = [kitti.domain_shift(stats, state["seen"]) for stats in records["stats"]]
-    if any(shifts):
-        first = next(filter(None, shifts))
-        print(f"sequence {s.name}: {sum(map(bool, shifts))} of {len(s)} scans are unlike those the "
-              f"weights were trained on, the poses may be wrong: {first}", file=sys.stderr)
+    warn_about_shift(s, records, state["seen"])
     motions = predict_motions(net, records, device, refine=refine)
     poses = accumulate(motions)
     metrics.write_poses(out / f"{s.name}.txt", kitti.velo_to_camera(poses, s.Tr))
@@ -844,6 +849,32 @@ def evaluate_sequence(net, state, s, records, out, device="cpu", refine=0):
         segments = metrics.segment_errors(s.poses_cam, kitti.velo_to_camera(T, s.Tr))
         errors[predictor] = segments, metrics.step_errors(s.poses, T)
     return errors
+
+
+def evaluate_folder(net, state, s, out, device="cpu", refine=0, plot=False, say=print):
+    """Predict the trajectory of a `kitti.ScanFolder`: OUT/poses.txt, OUT/poses.tum, LiDAR frame."""
+    began = time.monotonic()
+    (records,), _ = load_geometry([s], net.config)
+    warn_about_shift(s, records, state["seen"])
+    poses = accumulate(predict_motions(for_device(net, device), records, device, refine=refine))
+    rate = len(s) / (time.monotonic() - began)
+    clear_results(out)
+    metrics.write_poses(out / "poses.txt", poses)
+    kitti.write_tum(out / "poses.tum", poses, s.times)
+    files, length = ["poses.txt", "poses.tum"], metrics.path_lengths(poses)[-1]
+    say(f"{s.folder}: {len(s)} scans, path of {length:.1f} m, {rate:.1f} scans a second")
+    for note in s.notes:
+        say(f"note          {note}")
+    say("frame         of the LiDAR in the first scan: x forward, y left, z up, metres\n"
+        f"trajectory    {out}/poses.txt (KITTI pose file)\n"
+        f"              {out}/poses.tum (t x y z qx qy qz qw, t in seconds)")
+    if plot:
+        metrics.draw(out / "plot.png", {s.name: (None, poses)})
+        files.append("plot.png")
+        say(f"picture       {out}/plot.png (from above)")
+    source = {"data": str(s.folder), "refine": refine, "files": files}
+    metrics.write_json(out / "results.json", source | {"path_m": length, "scans": len(s)})
+    return out
 
 
 def summarize(errors, trained_on):
@@ -882,8 +913,9 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
              say=print, network=D3DLO):
     """The command `eval`: trajectories, table and results.json of `weights` (None: shipped).
 
-    data: a folder in KITTI's layout, None for the simulated test and validation sequences; network:
-    the class of the network. Returns the folder of the results. ValueError, OSError.
+    data: a folder in KITTI's layout or a plain folder of scans, for which there is a trajectory
+    only; None for the simulated test and validation sequences. network: the class of the network.
+    Returns the folder of the results. ValueError, OSError.
     """
     check_device(device)
     check_number("refine", refine)
@@ -895,6 +927,8 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     out = kitti.new_name("results") if out is None else Path(out)
     check_output(out, root)
     chosen = kitti.open_sequences(root, sequences)
+    if isinstance(chosen[0], kitti.ScanFolder):
+        return evaluate_folder(net, state, chosen[0], out, device, refine, plot, say)
     geometry, fingerprints = load_geometry(chosen, net.config)
     net = for_device(net, device)
     clear_results(out)
@@ -913,7 +947,7 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     if plot:
         T = {s.name: (s.poses_cam, metrics.read_poses(out / f"{s.name}.txt")) for s in chosen}
         metrics.draw(out / "plot.png", T)
-        say(f"picture       {out}/plot.png (from above in the camera's frame, errors by length)")
+        say(f"picture       {out}/plot.png (from above, errors by length)")
         files.append("plot.png")
     source = {"weights": str(weights or WEIGHTS), "data": str(root), "refine": refine}
     metrics.write_json(out / "results.json", source | results | {"files": files})
@@ -1220,10 +1254,10 @@ def check_number(name, value):
 
 
 def check_output(path, root):
-    """ValueError when a result would be written among the data, where it could replace the truth."""
-    for folder in (Path(root) / "sequences", Path(root) / "poses"):
-        if Path(path).resolve().is_relative_to(folder.resolve()):
-            raise ValueError(f"--out {path}: is in {folder}, where the data are; choose another")
+    """ValueError when results would be written among the data, where they could replace some."""
+    path, root = Path(path).resolve(), Path(root).resolve()
+    if path == root or any(path.is_relative_to(root / name) for name in ("sequences", "poses")):
+        raise ValueError(f"--out {path}: the data are there; choose another folder")
 
 
 def data_root(data, names, whole=False):
@@ -1284,10 +1318,9 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
         root = data_root(data, sequences, whole=True)
         check_output(run, root)
         chosen, held_out = choose_sequences(root, sequences)
+        n, names, motions = len(chosen), [s.name for s in chosen], [s.motions() for s in chosen]
         # Held-out scans too, so that a broken one is found now and not after the training
         geometry, prints = load_geometry(chosen + held_out, net.config)
-        n, motions = len(chosen), [s.motions() for s in chosen]
-        names = [s.name for s in chosen]
         fingerprints = dict(zip(names, prints))
         if checkpoint and checkpoint["train"] != fingerprints:
             raise ValueError(f"{run}: the data have changed since this training run started; "
@@ -1384,25 +1417,27 @@ def command_line(argv):
             "  python d3dlo.py train --out RUN --resume")))
     eval_options(commands.add_parser(
         "eval", **how, help="predict trajectories and print KITTI's errors", description=(
-            "Predict the trajectories of sequences, write them and print KITTI's errors.\n\n"
+            "Predict the trajectories of sequences, write them and print KITTI's errors.\n"
+            "A plain folder of scans (*.bin or *.npy) gives a trajectory only.\n\n"
             "  python d3dlo.py eval\n"
+            "  python d3dlo.py eval --data FOLDER --plot\n"
             "  python d3dlo.py eval --data ROOT --sequences test\n"
             "  python d3dlo.py eval --data ROOT --weights RUN --sequences 11 12")))
     return vars(parser.parse_args(argv))
 
 
-def data_options(command):
+def data_options(command, layouts):
     """The options that both commands have."""
     add = command.add_argument_group("data").add_argument
     add("--data", metavar="ROOT", help=(
-        f"folder in KITTI odometry layout (default: a simulated city, made in {SIMULATED})"))
+        f"{layouts} (default: a simulated city, made in {SIMULATED})"))
     add("--sequences", nargs="+", metavar="NN", help=(
         "names, or splits: train, test, validation, all"))
 
 
 def train_options(command):
     """The options of `train`."""
-    data_options(command)
+    data_options(command, "folder in KITTI odometry layout")
     add = command.add_argument_group("network").add_argument
     add("--weights", metavar="FILE|RUN", help=(
         "start from these weights and keep their network and input"))
@@ -1432,7 +1467,7 @@ def train_options(command):
 
 def eval_options(command):
     """The options of `eval`."""
-    data_options(command)
+    data_options(command, "folder in KITTI odometry layout, or of scans")
     add = command.add_argument_group("network").add_argument
     add("--weights", metavar="FILE|RUN", help=(
         "weights, or the folder of a training run (default: those shipped)"))
