@@ -1015,10 +1015,10 @@ def test_eval_takes_a_plain_folder_of_scans(here, weights, capsys, save, name, s
     assert_allclose(rows[:, 0], np.arange(12) / 10)
     assert_allclose(rows[:, 1:4], poses[:, :3, 3], atol=1e-6)
     assert_allclose(Rotation.from_quat(rows[:, 4:]).as_matrix(), poses[:, :3, :3], atol=1e-6)
-    metres, speed = re.search(r"^drive: 12 scans, (\S+) m, (\S+) scans a second", out).groups()
+    metres, speed = re.search(r"^drive: 12 scans, path of (\S+) m, (\S+) scans a second", out).groups()
     assert float(metres) == pytest.approx(metrics.path_lengths(poses)[-1], abs=0.06)
     assert float(speed) > 0 and complaint(err) == []
-    assert "LiDAR's frame" in out and "out/poses.txt" in out and "out/poses.tum" in out
+    assert "frame         of the LiDAR" in out and "out/poses.txt" in out and "out/poses.tum" in out
     assert "10 scans a second" in out and ("divided by 255" in out) == (scale > 1)
     (here / "drive" / "times.txt").write_text("\n".join(f"{7 + i}" for i in range(12)))
     assert d3dlo.main([*arguments, "again"]) == 0
