@@ -726,6 +726,16 @@ def test_ten_scans_spread_over_a_folder_decide_on_the_intensities_of_all(tmp_pat
         np.save(path, scans[bright])
 
 
+def test_a_scan_cut_short_is_named_before_any_work_begins(tmp_path):
+    write_folder(tmp_path / "drive", scans=37, save=save_bin, name="{}.bin")
+    for i in range(1, 38):                              # not only those that are looked into
+        whole = (tmp_path / "drive" / f"{i}.bin").read_bytes()
+        (tmp_path / "drive" / f"{i}.bin").write_bytes(whole[:-1])
+        with pytest.raises(ValueError, match=f"/{i}.bin has 799 bytes"):
+            kitti.open_sequences(tmp_path / "drive")
+        (tmp_path / "drive" / f"{i}.bin").write_bytes(whole)
+
+
 def save_as(name, array):
     return lambda folder: np.save(folder / name, array, allow_pickle=True)
 
