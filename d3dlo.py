@@ -131,6 +131,8 @@ def check_config(config):
     require(positive(config.lr), "lr must be positive")
     require(config.frozen == 0 or positive(config.frozen) and config.frozen < 1,
             "frozen must be a fraction, from 0 to below 1")
+    require(isinstance(config.plane, bool) and isinstance(config.augment, bool),
+            "plane and augment must be True or False")
     require(config.optimizer in ("adam", "muon"), "optimizer must be adam or muon")
     require(config.schedule in ("steps", "one-cycle"), "schedule must be steps or one-cycle")
     require(config.swap in ("both", "random"), "swap must be both or random")
@@ -547,7 +549,7 @@ class Training:
 
     def store_weights(self, net):
         """RUN/weights.pt, a usable network."""
-        save(self.run / "weights.pt", net.state_dict(), config=self.config.as_dict(),
+        save(self.run / "weights.pt", model=net.state_dict(), config=self.config.as_dict(),
              step=self.step, **self.facts)
 
     @contextmanager
@@ -745,16 +747,19 @@ WEIGHTS = Path(__file__).with_name("d3dlo.pt")  # the weights shipped
 STORE_EVERY = 300.0  # seconds between two checkpoints of a training run
 
 
-def checksum(model):
-    """CRC-32 of all tensors of a state_dict."""
-    return zlib.crc32(b"".join(tensor.cpu().numpy().tobytes() for tensor in model.values()))
+def checksum(state):
+    """CRC-32 of the tensors of a network and of the facts stored with them."""
+    facts = ("config", "step", "train", "before", "mean_motion", "seen")
+    text = json.dumps([state[name] for name in facts], sort_keys=True)
+    tensors = [tensor.cpu().numpy().tobytes() for tensor in state["model"].values()]
+    return zlib.crc32(b"".join([text.encode(), *tensors]))
 
 
-def save(path, model, **state):
-    """Write a state_dict and plain values to a file. OSError when that fails."""
+def save(path, **state):
+    """Write weights or a checkpoint: state_dicts and plain values. OSError when that fails."""
     with metrics.replacing(path) as temporary, open(temporary, "wb") as file:
         try:
-            torch.save({**state, "model": model, "crc": checksum(model), "format": FORMAT}, file)
+            torch.save({**state, "crc": checksum(state), "format": FORMAT}, file)
         except RuntimeError as error:  # what torch raises when the disk is full
             reason = str(error).splitlines()[0]
             raise OSError(f"{path}: could not be written ({reason:.80})") from None
@@ -780,10 +785,7 @@ def load_weights(path: str | Path | None = None, network=D3DLO, checkpoint: bool
                              f"this one reads {FORMAT}")
         net = network(Config(**state["config"]))
         net.load_state_dict(state["model"])
-        if not ({"step", "train", "before"} <= state.keys()
-                and np.shape(state["mean_motion"]) == (6,)
-                and np.shape(state["seen"]) == (2, len(kitti.STATS))
-                and checksum(state["model"]) == state["crc"]):
+        if checksum(state) != state["crc"]:
             raise ValueError("damaged")
     except Exception as error:  # torch and pickle raise many exception types for a bad file
         reason = f"{type(error).__name__}: {error}".splitlines()[-1].strip()
@@ -1391,12 +1393,17 @@ def write_run(run, arguments, config):
 def read_run(run):
     """RUN/config.json -> Config, data, sequences, seed and weights of a training run."""
     try:
-        facts = json.loads((run / "config.json").read_text(encoding="utf-8"))
-        arguments = (facts["arguments"][name] for name in ("data", "sequences", "seed", "weights"))
-        return Config(**facts["config"]), *arguments
-    except (ValueError, KeyError, TypeError, OSError):
+        content = json.loads((run / "config.json").read_text(encoding="utf-8"))
+        config, arguments = Config(**content["config"]), content["arguments"]
+        data, sequences, seed, weights = (arguments[name] for name in
+                                          ("data", "sequences", "seed", "weights"))
+        check_number("seed", seed)
+        if not all(isinstance(text, str) for text in (data or "", weights or "", *sequences)):
+            raise ValueError("damaged")
+    except (ValueError, KeyError, TypeError, AttributeError, OSError):
         raise ValueError(f"{run}/config.json: missing or damaged, so there is no training run to "
                          "resume; name its folder by --out") from None
+    return config, data, sequences, seed, weights
 
 
 def command_line(argv):

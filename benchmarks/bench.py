@@ -111,7 +111,7 @@ def prepare(s, form):
     one without `keep_freed_memory`.
     """
     if form != "default malloc":
-        d3dlo.keep_freed_memory()
+        kitti.keep_freed_memory()
     torch.manual_seed(0)
     net = d3dlo.D3DLO(CONFIG)
     net = net if form.startswith("plain") else d3dlo.fast(net)
@@ -134,13 +134,15 @@ def inference(s, form):
         return seconds(lambda: net(batch)) / len(batch.p)
 
 
-def training_steps(net, geometry, motions, batches, training=True):
+def training_steps(net, geometry, motions, batches, frozen=False):
     """Train on the first STEPS batches, and only make the others. Returns seconds per pair."""
-    state = d3dlo.training_state(net, d3dlo.UnweightedLoss(), STEPS)
+    run = d3dlo.Training(net, geometry, motions, "")
+    run.model = net  # in the form that is measured
+    run.frozen_from = -1 if frozen else batches
     times, last = [], time.perf_counter()
     for i, (batch, T) in enumerate(d3dlo.batches(geometry, motions, CONFIG, (0,), 0, batches)):
         if i < STEPS:
-            d3dlo.training_step(net.train(training), batch, T, state)
+            run.advance(batch, T)
             times.append((time.perf_counter() - last) / len(T))
             last = time.perf_counter()
     return np.median(times[WARM_UP:])
@@ -153,7 +155,7 @@ def training(s, form):
 
 def fixed_statistics(s, form):
     """The same with BatchNorm's statistics fixed, as at the end of training."""
-    return training_steps(*prepare(s, form), STEPS, training=False)
+    return training_steps(*prepare(s, form), STEPS, frozen=True)
 
 
 def cache(s, form):

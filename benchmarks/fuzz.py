@@ -155,7 +155,8 @@ def finite(array, *shape):
 
 def read_record(path):
     """A scan file -> the record that the cache keeps of it."""
-    row = kitti._cache_row(path, functools.partial(d3dlo.scan_geometry, config=SMALL), CACHE_ROW)
+    compute = functools.partial(d3dlo.scan_geometry, config=SMALL)
+    row = kitti._cache_row((path, 1), compute, CACHE_ROW)
     return np.frombuffer(row, CACHE_ROW)["record"][0]
 
 
@@ -185,13 +186,13 @@ def make_readers(folder, rng):
     metrics.write_poses(folder / "poses.txt", poses)
     (folder / "calib.txt").write_text(kitti._calibration()[1])
     compute = functools.partial(d3dlo.scan_geometry, config=SMALL)
-    row = kitti._cache_row(folder / "000000.bin", compute, CACHE_ROW)
+    row = kitti._cache_row((folder / "000000.bin", 1), compute, CACHE_ROW)
     rows = np.frombuffer(row * 3, CACHE_ROW)
     np.save(folder / "cache.npy", rows)
     arguments = dict(data=None, sequences=["00"], seed=0, device="cpu", weights=None)
     d3dlo.write_run(folder, arguments, SMALL)
     model = d3dlo.D3DLO(SMALL).state_dict()
-    d3dlo.save(folder / "weights.pt", model, config=SMALL.as_dict(), step=1,
+    d3dlo.save(folder / "weights.pt", model=model, config=SMALL.as_dict(), step=1,
                train={"00": "0" * 16}, before=["1" * 16], mean_motion=[0.0] * 6,
                seen=[[1.0] * len(kitti.STATS)] * 2)
 
