@@ -113,10 +113,10 @@ def check_config(config):
             raise ValueError(f"Config: {message}")
 
     def whole(x, most=2**31):
-        return isinstance(x, int) and 1 <= x <= most
+        return type(x) is int and 1 <= x <= most
 
     def positive(x):
-        return isinstance(x, (int, float)) and 0 < x < math.inf
+        return type(x) in (int, float) and 0 < x < math.inf
 
     sa1, fe, sa2, sa3, mlp = config.sa1, config.fe, config.sa2, config.sa3, config.mlp.mlp
     widths = [sa1.mlp, fe.mlp, sa2.mlp, sa3.mlp, config.mpn.mlp, mlp]
@@ -154,12 +154,13 @@ def fps_textbook(xyz, n, start=0):
     xyz (N,3), index of the first centroid -> indices (n,) of the centroids. Ties go to the lowest
     index. `farthest_point_sampling` in part 7 returns the same indices faster, so it is used.
     """
-    centroids = np.empty(n, np.int64)
-    centroids[0] = start
+    x, y, z = np.ascontiguousarray(xyz.T)
     min_dist = np.full(len(xyz), np.inf, xyz.dtype)  # squared distance to the nearest centroid
+    centroids = np.full(n, start)
     for i in range(1, n):
-        dx, dy, dz = (xyz - xyz[centroids[i - 1]]).T
-        min_dist = np.minimum(min_dist, dx * dx + dy * dy + dz * dz)
+        j = centroids[i - 1]
+        dist = (x - x[j]) ** 2 + (y - y[j]) ** 2 + (z - z[j]) ** 2  # (N,)
+        min_dist = np.minimum(min_dist, dist)
         centroids[i] = np.argmax(min_dist)
     return centroids
 
@@ -484,8 +485,8 @@ class Training:
         self.optimizers = make_optimizers(net, self.objective)
         self.schedulers = [make_scheduler(o, self.config, self.total) for o in self.optimizers]
 
-    def batches(self):
-        """The batches that are left."""
+    def remaining_batches(self):
+        """The batches of the steps that are left."""
         return batches(self.geometry, self.motions, self.config, (self.seed,), self.step,
                        self.total, self.device)
 
@@ -610,7 +611,7 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", checkpoint=None, say=
         training.load(checkpoint)
     left, stored = training.total - training.step, time.monotonic()
     with kitti.delayed_interrupt() as interrupted, training.kept():
-        for batch, T in progress(training.batches(), left, "training, batches"):
+        for batch, T in progress(training.remaining_batches(), left, "training, batches"):
             rate = training.learning_rate()
             training.advance(batch, T)
             if training.step % training.per_epoch == 0:
