@@ -113,15 +113,15 @@ def check_config(config):
             raise ValueError(f"Config: {message}")
 
     def whole(x, most=2**31):
-        return isinstance(x, int) and 1 <= x <= most
+        return type(x) is int and 1 <= x <= most
 
     def positive(x):
-        return isinstance(x, (int, float)) and 0 < x < math.inf
+        return type(x) in (int, float) and 0 < x < math.inf
 
     sa1, fe, sa2, sa3, mlp = config.sa1, config.fe, config.sa2, config.sa3, config.mlp.mlp
     widths = [sa1.mlp, fe.mlp, sa2.mlp, sa3.mlp, config.mpn.mlp, mlp]
     require(all(positive(sa.r) for sa in (sa1, sa2, sa3)), "every radius must be positive")
-    require(all(whole(sa.n_fps, 65535) for sa in (sa1, sa2, sa3)), "n_fps must be 1 to 65,535")  # u2
+    require(all(whole(sa.n_fps, 65535) for sa in (sa1, sa2, sa3)), "n_fps must be 1 to 65,535")
     require(sa1.n_fps >= sa2.n_fps >= sa3.n_fps, "n_fps must not grow from layer to layer")
     require(all(whole(x.n_n, 1024) for x in (sa1, fe, sa2, sa3)), "n_n must be 1 to 1,024")
     require(all(len(w) > 1 and all(map(whole, w)) for w in widths), "an MLP has 2 layers at least")
@@ -131,6 +131,8 @@ def check_config(config):
     require(positive(config.lr), "lr must be positive")
     require(config.frozen == 0 or positive(config.frozen) and config.frozen < 1,
             "frozen must be a fraction, from 0 to below 1")
+    require(isinstance(config.plane, bool) and isinstance(config.augment, bool),
+            "plane and augment must be True or False")
     require(config.optimizer in ("adam", "muon"), "optimizer must be adam or muon")
     require(config.schedule in ("steps", "one-cycle"), "schedule must be steps or one-cycle")
     require(config.swap in ("both", "random"), "swap must be both or random")
@@ -150,14 +152,15 @@ def fps_textbook(xyz, n, start=0):
     """Farthest point sampling: each new centroid is the point farthest from all centroids so far.
 
     xyz (N,3), index of the first centroid -> indices (n,) of the centroids. Ties go to the lowest
-    index. `farthest_point_sampling` in part 7 returns the same indices, faster, and is used instead.
+    index. `farthest_point_sampling` in part 7 returns the same indices faster, so it is used.
     """
-    centroids = np.empty(n, np.int64)
-    centroids[0] = start
+    x, y, z = np.ascontiguousarray(xyz.T)
     min_dist = np.full(len(xyz), np.inf, xyz.dtype)  # squared distance to the nearest centroid
+    centroids = np.full(n, start)
     for i in range(1, n):
-        dx, dy, dz = (xyz - xyz[centroids[i - 1]]).T
-        min_dist = np.minimum(min_dist, dx * dx + dy * dy + dz * dz)
+        j = centroids[i - 1]
+        dist = (x - x[j]) ** 2 + (y - y[j]) ** 2 + (z - z[j]) ** 2  # (N,)
+        min_dist = np.minimum(min_dist, dist)
         centroids[i] = np.argmax(min_dist)
     return centroids
 
@@ -482,8 +485,8 @@ class Training:
         self.optimizers = make_optimizers(net, self.objective)
         self.schedulers = [make_scheduler(o, self.config, self.total) for o in self.optimizers]
 
-    def batches(self):
-        """The batches that are left."""
+    def remaining_batches(self):
+        """The batches of the steps that are left."""
         return batches(self.geometry, self.motions, self.config, (self.seed,), self.step,
                        self.total, self.device)
 
@@ -547,7 +550,7 @@ class Training:
 
     def store_weights(self, net):
         """RUN/weights.pt, a usable network."""
-        save(self.run / "weights.pt", net.state_dict(), config=self.config.as_dict(),
+        save(self.run / "weights.pt", model=net.state_dict(), config=self.config.as_dict(),
              step=self.step, **self.facts)
 
     @contextmanager
@@ -608,7 +611,7 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", checkpoint=None, say=
         training.load(checkpoint)
     left, stored = training.total - training.step, time.monotonic()
     with kitti.delayed_interrupt() as interrupted, training.kept():
-        for batch, T in progress(training.batches(), left, "training, batches"):
+        for batch, T in progress(training.remaining_batches(), left, "training, batches"):
             rate = training.learning_rate()
             training.advance(batch, T)
             if training.step % training.per_epoch == 0:
@@ -745,16 +748,19 @@ WEIGHTS = Path(__file__).with_name("d3dlo.pt")  # the weights shipped
 STORE_EVERY = 300.0  # seconds between two checkpoints of a training run
 
 
-def checksum(model):
-    """CRC-32 of all tensors of a state_dict."""
-    return zlib.crc32(b"".join(tensor.cpu().numpy().tobytes() for tensor in model.values()))
+def checksum(state):
+    """CRC-32 of the tensors of a network and of the facts stored with them."""
+    facts = ("config", "step", "train", "before", "mean_motion", "seen")
+    text = json.dumps([state[name] for name in facts], sort_keys=True)
+    tensors = [tensor.cpu().numpy().tobytes() for tensor in state["model"].values()]
+    return zlib.crc32(b"".join([text.encode(), *tensors]))
 
 
-def save(path, model, **state):
-    """Write a state_dict and plain values to a file. OSError when that fails."""
+def save(path, **state):
+    """Write weights or a checkpoint: state_dicts and plain values. OSError when that fails."""
     with metrics.replacing(path) as temporary, open(temporary, "wb") as file:
         try:
-            torch.save({**state, "model": model, "crc": checksum(model), "format": FORMAT}, file)
+            torch.save({**state, "crc": checksum(state), "format": FORMAT}, file)
         except RuntimeError as error:  # what torch raises when the disk is full
             reason = str(error).splitlines()[0]
             raise OSError(f"{path}: could not be written ({reason:.80})") from None
@@ -780,10 +786,7 @@ def load_weights(path: str | Path | None = None, network=D3DLO, checkpoint: bool
                              f"this one reads {FORMAT}")
         net = network(Config(**state["config"]))
         net.load_state_dict(state["model"])
-        if not ({"step", "train", "before"} <= state.keys()
-                and np.shape(state["mean_motion"]) == (6,)
-                and np.shape(state["seen"]) == (2, len(kitti.STATS))
-                and checksum(state["model"]) == state["crc"]):
+        if checksum(state) != state["crc"]:
             raise ValueError("damaged")
     except Exception as error:  # torch and pickle raise many exception types for a bad file
         reason = f"{type(error).__name__}: {error}".splitlines()[-1].strip()
@@ -822,16 +825,21 @@ def load_geometry(sequences, config, cache="cache"):
 GEOMETRY = 4  # increase it when `scan_geometry` changes, so that old caches are not read
 
 
+def warn_about_shift(s, records, seen):
+    """Say on stderr how many scans of a sequence are unlike those of the training."""
+    shifts = [kitti.domain_shift(stats, seen) for stats in records["stats"]]
+    if any(shifts):
+        print(f"sequence {s.name}: {sum(map(bool, shifts))} of {len(s)} scans are unlike those the "
+              f"weights were trained on, the poses may be wrong: {next(filter(None, shifts))}",
+              file=sys.stderr)
+
+
 def evaluate_sequence(net, state, s, records, out, device="cpu", refine=0):
     """Predict the trajectory of a sequence and write OUT/NN.txt, a KITTI pose file.
 
     Returns {predictor: (segment errors, step errors)}, empty without ground truth.
     """
-    shifts = [kitti.domain_shift(stats, state["seen"]) for stats in records["stats"]]
-    if any(shifts):
-        first = next(filter(None, shifts))
-        print(f"sequence {s.name}: {sum(map(bool, shifts))} of {len(s)} scans are unlike those the "
-              f"weights were trained on, the poses may be wrong: {first}", file=sys.stderr)
+    warn_about_shift(s, records, state["seen"])
     motions = predict_motions(net, records, device, refine=refine)
     poses = accumulate(motions)
     metrics.write_poses(out / f"{s.name}.txt", kitti.velo_to_camera(poses, s.Tr))
@@ -844,6 +852,32 @@ def evaluate_sequence(net, state, s, records, out, device="cpu", refine=0):
         segments = metrics.segment_errors(s.poses_cam, kitti.velo_to_camera(T, s.Tr))
         errors[predictor] = segments, metrics.step_errors(s.poses, T)
     return errors
+
+
+def evaluate_folder(net, state, s, out, device="cpu", refine=0, plot=False, say=print):
+    """Predict the trajectory of a `kitti.ScanFolder`: OUT/poses.txt, OUT/poses.tum, LiDAR frame."""
+    began = time.monotonic()
+    (records,), _ = load_geometry([s], net.config)
+    warn_about_shift(s, records, state["seen"])
+    poses = accumulate(predict_motions(for_device(net, device), records, device, refine=refine))
+    rate = len(s) / (time.monotonic() - began)
+    clear_results(out)
+    metrics.write_poses(out / "poses.txt", poses)
+    kitti.write_tum(out / "poses.tum", poses, s.times)
+    files, length = ["poses.txt", "poses.tum"], metrics.path_lengths(poses)[-1]
+    say(f"{s.folder}: {len(s)} scans, path of {length:.1f} m, {rate:.1f} scans a second")
+    for note in s.notes:
+        say(f"note          {note}")
+    say("frame         of the LiDAR in the first scan: x forward, y left, z up, metres\n"
+        f"trajectory    {out}/poses.txt (KITTI pose file)\n"
+        f"              {out}/poses.tum (t x y z qx qy qz qw, t in seconds)")
+    if plot:
+        metrics.draw(out / "plot.png", {s.name: (None, poses)})
+        files.append("plot.png")
+        say(f"picture       {out}/plot.png (from above)")
+    source = {"data": str(s.folder), "refine": refine, "files": files}
+    metrics.write_json(out / "results.json", source | {"path_m": length, "scans": len(s)})
+    return out
 
 
 def summarize(errors, trained_on):
@@ -882,8 +916,9 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
              say=print, network=D3DLO):
     """The command `eval`: trajectories, table and results.json of `weights` (None: shipped).
 
-    data: a folder in KITTI's layout, None for the simulated test and validation sequences; network:
-    the class of the network. Returns the folder of the results. ValueError, OSError.
+    data: a folder in KITTI's layout or a plain folder of scans, for which there is a trajectory
+    only; None for the simulated test and validation sequences. network: the class of the network.
+    Returns the folder of the results. ValueError, OSError.
     """
     check_device(device)
     check_number("refine", refine)
@@ -895,6 +930,8 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     out = kitti.new_name("results") if out is None else Path(out)
     check_output(out, root)
     chosen = kitti.open_sequences(root, sequences)
+    if isinstance(chosen[0], kitti.ScanFolder):
+        return evaluate_folder(net, state, chosen[0], out, device, refine, plot, say)
     geometry, fingerprints = load_geometry(chosen, net.config)
     net = for_device(net, device)
     clear_results(out)
@@ -913,7 +950,7 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     if plot:
         T = {s.name: (s.poses_cam, metrics.read_poses(out / f"{s.name}.txt")) for s in chosen}
         metrics.draw(out / "plot.png", T)
-        say(f"picture       {out}/plot.png (from above in the camera's frame, errors by length)")
+        say(f"picture       {out}/plot.png (from above, errors by length)")
         files.append("plot.png")
     source = {"weights": str(weights or WEIGHTS), "data": str(root), "refine": refine}
     metrics.write_json(out / "results.json", source | results | {"files": files})
@@ -1220,10 +1257,10 @@ def check_number(name, value):
 
 
 def check_output(path, root):
-    """ValueError when a result would be written among the data, where it could replace the truth."""
-    for folder in (Path(root) / "sequences", Path(root) / "poses"):
-        if Path(path).resolve().is_relative_to(folder.resolve()):
-            raise ValueError(f"--out {path}: is in {folder}, where the data are; choose another")
+    """ValueError when results would be written among the data, where they could replace some."""
+    path, root = Path(path).resolve(), Path(root).resolve()
+    if path == root or any(path.is_relative_to(root / name) for name in ("sequences", "poses")):
+        raise ValueError(f"--out {path}: the data are there; choose another folder")
 
 
 def data_root(data, names, whole=False):
@@ -1284,10 +1321,9 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
         root = data_root(data, sequences, whole=True)
         check_output(run, root)
         chosen, held_out = choose_sequences(root, sequences)
+        n, names, motions = len(chosen), [s.name for s in chosen], [s.motions() for s in chosen]
         # Held-out scans too, so that a broken one is found now and not after the training
         geometry, prints = load_geometry(chosen + held_out, net.config)
-        n, motions = len(chosen), [s.motions() for s in chosen]
-        names = [s.name for s in chosen]
         fingerprints = dict(zip(names, prints))
         if checkpoint and checkpoint["train"] != fingerprints:
             raise ValueError(f"{run}: the data have changed since this training run started; "
@@ -1358,12 +1394,17 @@ def write_run(run, arguments, config):
 def read_run(run):
     """RUN/config.json -> Config, data, sequences, seed and weights of a training run."""
     try:
-        facts = json.loads((run / "config.json").read_text(encoding="utf-8"))
-        arguments = (facts["arguments"][name] for name in ("data", "sequences", "seed", "weights"))
-        return Config(**facts["config"]), *arguments
-    except (ValueError, KeyError, TypeError, OSError):
+        content = json.loads((run / "config.json").read_text(encoding="utf-8"))
+        config, arguments = Config(**content["config"]), content["arguments"]
+        data, sequences, seed, weights = (arguments[name] for name in
+                                          ("data", "sequences", "seed", "weights"))
+        check_number("seed", seed)
+        if not all(isinstance(text, str) for text in (data or "", weights or "", *sequences)):
+            raise ValueError("damaged")
+    except (ValueError, KeyError, TypeError, AttributeError, OSError):
         raise ValueError(f"{run}/config.json: missing or damaged, so there is no training run to "
                          "resume; name its folder by --out") from None
+    return config, data, sequences, seed, weights
 
 
 def command_line(argv):
@@ -1384,25 +1425,27 @@ def command_line(argv):
             "  python d3dlo.py train --out RUN --resume")))
     eval_options(commands.add_parser(
         "eval", **how, help="predict trajectories and print KITTI's errors", description=(
-            "Predict the trajectories of sequences, write them and print KITTI's errors.\n\n"
+            "Predict the trajectories of sequences, write them and print KITTI's errors.\n"
+            "A plain folder of scans (*.bin or *.npy) gives a trajectory only.\n\n"
             "  python d3dlo.py eval\n"
+            "  python d3dlo.py eval --data FOLDER --plot\n"
             "  python d3dlo.py eval --data ROOT --sequences test\n"
             "  python d3dlo.py eval --data ROOT --weights RUN --sequences 11 12")))
     return vars(parser.parse_args(argv))
 
 
-def data_options(command):
+def data_options(command, layouts):
     """The options that both commands have."""
     add = command.add_argument_group("data").add_argument
     add("--data", metavar="ROOT", help=(
-        f"folder in KITTI odometry layout (default: a simulated city, made in {SIMULATED})"))
+        f"{layouts} (default: a simulated city, made in {SIMULATED})"))
     add("--sequences", nargs="+", metavar="NN", help=(
         "names, or splits: train, test, validation, all"))
 
 
 def train_options(command):
     """The options of `train`."""
-    data_options(command)
+    data_options(command, "folder in KITTI odometry layout")
     add = command.add_argument_group("network").add_argument
     add("--weights", metavar="FILE|RUN", help=(
         "start from these weights and keep their network and input"))
@@ -1432,7 +1475,7 @@ def train_options(command):
 
 def eval_options(command):
     """The options of `eval`."""
-    data_options(command)
+    data_options(command, "folder in KITTI odometry layout, or of scans")
     add = command.add_argument_group("network").add_argument
     add("--weights", metavar="FILE|RUN", help=(
         "weights, or the folder of a training run (default: those shipped)"))

@@ -6,6 +6,7 @@ in the Velodyne frame, because that is what the points are in: T_velo = inv(Tr) 
 
     python kitti.py simulate data/city      # an HDL-64E drives through 11 little cities, with exact ground truth: 2,620 scans, 4.2 GB
     python kitti.py simulate data/tiny --sequences 00 07 --scans 40 --azimuth 900
+    python kitti.py raw DRIVE data/raw      # a drive of KITTI's raw data, with ground truth
 """
 import argparse, ctypes, functools, hashlib, importlib.metadata, itertools, json, os, platform, re, shutil, signal, subprocess, sys
 import threading, time, warnings, zlib
@@ -17,7 +18,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from metrics import read_poses, replacing, temporary_beside, write_poses
+from metrics import path_lengths, read_poses, replacing, temporary_beside, write_poses
 
 try:
     import fcntl
@@ -29,19 +30,53 @@ SPLITS = {"train": ("00", "01", "02", "08", "09"), "test": ("03", "04", "05", "0
 
 # ---------------------------------------------------------------------------------------------------------------- files
 
+FIVE_FLOATS = ("If it is nuScenes', with five floats per point, convert each file with "
+               "np.save(NEW, np.fromfile(OLD, np.float32).reshape(-1, 5)[:, :4])")
+
+
 def _check_scan_size(path, size):
     if size == 0 or size % 16:
-        raise ValueError(f"{path} has {size} bytes, but a KITTI scan has 16 (four float32) for each point: copy or unpack it again.")
+        raise ValueError(f"{path} has {size} bytes, but a scan has 16 (four float32) per point: "
+                         f"copy or unpack it again. {FIVE_FLOATS}.")
 
 
-def read_scan(path: str | Path) -> np.ndarray:
-    """One velodyne/*.bin -> (N,4) float32: x, y, z [m] in the Velodyne frame, intensity 0..1, as in the file (NaN included).
-    Raises OSError when it cannot be read, ValueError when it is empty, of another format, or its size is no multiple of 16 bytes."""
-    data = Path(path).read_bytes()
+def read_scan(path: str | Path, intensity_max: float = 1) -> np.ndarray:
+    """Read one scan, a .bin or .npy file.
+
+    Returns (N,4) float32: x, y, z [m] in the LiDAR's frame, and the intensity divided by
+    `intensity_max`. NaN is kept. A .bin file holds four float32 per point, as KITTI's. A .npy file
+    holds an array (N,3) or (N,4); without a fourth column the intensities are 0. Raises OSError
+    when the file cannot be read, ValueError when it is empty, damaged or of another format.
+    """
+    path = Path(path)
+    scan = _read_npy(path) if path.suffix == ".npy" else _read_bin(path)
+    scan[:, 3] /= intensity_max
+    return scan
+
+
+def _read_bin(path):
+    data = path.read_bytes()
     if data.startswith((b"\x93NUMPY", b"ply\n", b"ply\r", b"# .PCD")):
         raise ValueError(f"{path} is no KITTI scan but another format: read it with its own library and hand over x, y, z, intensity.")
     _check_scan_size(path, len(data))
     return np.frombuffer(data, "<f4").reshape(-1, 4).astype(np.float32)  # (N,4), a copy that may be written to
+
+
+def _read_npy(path):
+    try:
+        points = np.load(path, allow_pickle=False)
+    except OSError:
+        raise
+    except Exception:  # np.load raises many exception types; all of them mean a corrupt file
+        raise ValueError(f"{path} is no NumPy file or is damaged: save the scan again.") from None
+    shape = getattr(points, "shape", ())  # an archive of several arrays has none
+    if len(shape) != 2 or shape[0] == 0 or shape[1] not in (3, 4) or points.dtype.kind not in "fiu":
+        raise ValueError(f"{path} has shape {shape}, but a scan is an array of numbers (N,3) or "
+                         "(N,4): save the columns x, y, z and intensity.")
+    scan = np.zeros((len(points), 4), np.float32)
+    with np.errstate(over="ignore"):  # numbers too large for float32 become infinite
+        scan[:, :points.shape[1]] = points
+    return scan
 
 
 def read_calib(path: str | Path) -> np.ndarray:
@@ -51,17 +86,27 @@ def read_calib(path: str | Path) -> np.ndarray:
     get = "KITTI's is in data_odometry_calib.zip; for drives of your own write the line Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0"
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: {get}.")
-    rows = re.findall(rb"^\s*Tr\s*:(.*)$", path.read_bytes(), re.M)
-    try:
-        Tr = np.vstack([np.array(b"".join(rows[:1]).split(), dtype=float).reshape(3, 4), [0, 0, 0, 1]])  # (4,4)
-    except ValueError:  # no such row, or not of 12 numbers
-        Tr = np.full((4, 4), np.nan)
-    R = Tr[:3, :3]
-    with np.errstate(all="ignore"):  # of absurd numbers
-        right = np.isfinite(Tr).all() and np.abs(R @ R.T - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0
-    if not right:
+    row = _calib_row(path, "Tr", 12).reshape(3, 4)
+    if not _is_rigid(row):
         raise ValueError(f"{path} has no row 'Tr' (Velodyne to camera) of 12 finite numbers, a rotation and a translation: {get}.")
-    return Tr
+    return np.vstack([row, [0, 0, 0, 1]])  # (4,4)
+
+
+def _calib_row(path, name, count):
+    """Row `name` of a calibration file: (count,) numbers, all NaN when there is no such row."""
+    rows = re.findall(rb"^\s*%s\s*:(.*)$" % name.encode(), path.read_bytes(), re.M)
+    try:
+        return np.array(rows[0].split(), dtype=float).reshape(count)
+    except (IndexError, ValueError):
+        return np.full(count, np.nan)
+
+
+def _is_rigid(row):
+    """Whether (3,4) is finite, with a rotation in its first three columns."""
+    R = row[:, :3]
+    with np.errstate(all="ignore"):  # absurd numbers overflow
+        rotation = np.abs(R @ R.T - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0
+    return bool(np.isfinite(row).all() and rotation)
 
 
 # --------------------------------------------------------------------------------------------------------------- frames
@@ -73,6 +118,15 @@ def invert(T):
     out = np.zeros_like(T)
     out[..., :3, :3], out[..., :3, 3:], out[..., 3, 3] = R, -R @ T[..., :3, 3:], 1
     return out
+
+
+def write_tum(path: str | Path, T: np.ndarray, times: np.ndarray) -> None:
+    """Write poses (n,4,4) at `times` (n,) [s] as a TUM trajectory file, through a temporary file.
+
+    A row is t x y z qx qy qz qw, with qw >= 0, in the frame of the poses."""
+    q = Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True)  # (n,4)
+    with replacing(path) as temporary, open(temporary, "w", newline="\n") as file:
+        np.savetxt(file, np.c_[times, T[:, :3, 3], q], fmt="%.9f")
 
 
 def camera_to_velo(T_cam, Tr):
@@ -114,6 +168,7 @@ class Sequence:
 
     name, scan_paths (list of n paths), Tr (4,4) = T_cam0_velo, poses_cam (n,4,4) as in the file or None, poses (n,4,4) = T_0t in the
     Velodyne frame or None. Raises FileNotFoundError or ValueError when anything is missing or does not fit together."""
+    intensity_max = 1  # of the files; KITTI's intensities are within 0..1
 
     def __init__(self, root, name):
         self.name, self.folder = name, Path(root) / "sequences" / name
@@ -141,39 +196,120 @@ class Sequence:
 
     def scan(self, i: int) -> np.ndarray:
         """Scan i as (N,4) float32, see `read_scan`."""
-        return read_scan(self.scan_paths[i])
+        return read_scan(self.scan_paths[i], self.intensity_max)
 
     def motions(self) -> np.ndarray:
         """(n-1,4,4) T_{t,t+1} = inv(T_t) @ T_{t+1} (paper eq. 1) in the Velodyne frame: maps points of scan t+1 into scan t.
         Raises ValueError when the sequence has no ground truth."""
         if self.poses is None:
-            raise ValueError(f"Sequence {self.name} has no ground truth: put the official poses/{self.name}.txt beside sequences/ "
-                             f"(SemanticKITTI's sequences/{self.name}/poses.txt is no truth, SuMa estimated it).")
+            raise ValueError(f"Sequence {self.name} has no ground truth: put it into ROOT/poses/"
+                             f"{self.name}.txt beside ROOT/sequences (SemanticKITTI's sequences/"
+                             f"{self.name}/poses.txt is no truth, SuMa estimated it).")
         return invert(self.poses[:-1]) @ self.poses[1:]
 
 
+class ScanFolder(Sequence):
+    """A plain folder of scans as a sequence: *.bin or *.npy, in natural order (2 before 10).
+
+    name is the folder's. There is no calibration and no ground truth: Tr, poses_cam and poses are
+    None. intensity_max is what intensities are divided by, 1 or 255. times (n,) are the seconds in
+    the folder's times.txt, or else those of 10 scans a second. notes is a list of lines that say
+    what was assumed. Raises ValueError when the files do not fit together or are no scans.
+    """
+
+    def __init__(self, folder):
+        self.folder = Path(folder)
+        self.name = self.folder.resolve().name
+        self.scan_paths = scans_in(folder)
+        self.Tr = self.poses_cam = self.poses = None
+        if len({path.suffix for path in self.scan_paths}) > 1:
+            raise ValueError(f"{folder} holds both .bin and .npy files: move one kind elsewhere.")
+        for path in self.scan_paths:
+            if path.suffix == ".bin":
+                _check_scan_size(path, path.stat().st_size)
+        largest = _largest_intensity(self.scan_paths)
+        self.intensity_max = 255 if largest > 1 else 1
+        self.times, self.notes = 0.1 * np.arange(len(self)), []
+        if largest == 0:
+            self.notes.append("there are no intensities; zeros are used, so expect larger errors")
+        if largest > 1:
+            self.notes.append(f"intensities reach {largest:.4g}; all are divided by 255")
+        if (self.folder / "times.txt").exists():
+            self.times = _read_times(self.folder / "times.txt", len(self))
+        else:
+            self.notes.append("there is no times.txt, one time in seconds per line; "
+                              "10 scans a second are assumed")
+
+
+def scans_in(folder):
+    """The *.bin and *.npy files of a folder, in natural order: list of paths."""
+    paths = [path for path in Path(folder).glob("[!.]*") if path.suffix in (".bin", ".npy")]
+    pad = lambda digits: digits[0].zfill(20)
+    return sorted(paths, key=lambda path: re.sub(r"\d+", pad, path.name))
+
+
+def _largest_intensity(paths):
+    """The largest intensity of ten scans spread over a folder; ValueError if it cannot be one."""
+    largest = 0
+    for i in np.unique(np.linspace(0, len(paths) - 1, 10).astype(int)):
+        intensity = read_scan(paths[i])[:, 3]
+        intensity = intensity[np.isfinite(intensity)]
+        if intensity.min(initial=0) < 0:
+            raise ValueError(f"{paths[i]}: the fourth value of a point is {intensity.min():.4g}, "
+                             "but no intensity is negative, so these are not x, y, z, intensity. "
+                             f"{FIVE_FLOATS}.")
+        if intensity.max(initial=0) > 255:
+            raise ValueError(f"{paths[i]} has intensities up to {intensity.max():.4g}, but they "
+                             "must lie within 0..1 or 0..255: rescale those of all scans.")
+        largest = max(largest, intensity.max(initial=0))
+    return largest
+
+
+def _read_times(path, n):
+    """(n,) seconds, one per line and increasing; ValueError when the file holds anything else."""
+    try:
+        times = np.array(path.read_bytes().split(), dtype=float)
+    except ValueError:
+        times = np.empty(0)
+    if len(times) != n or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        raise ValueError(f"{path} must hold {n} increasing numbers, the time of each scan in "
+                         "seconds: correct it, or remove it to assume 10 scans a second.")
+    return times
+
+
 def sequence_names(root: str | Path) -> list[str]:
-    """The sequences of ROOT that have scans. Raises FileNotFoundError when there are none, as where ROOT is not in KITTI's odometry layout."""
+    """The sequences of ROOT that have scans; a plain folder of scans is one, with its name.
+    Raises FileNotFoundError when there are none, as in an unknown layout."""
     root = Path(root)
+    if not (root / "sequences").exists() and scans_in(root):
+        return [root.resolve().name]
     there = sorted(p.parent.name for p in root.glob("sequences/[!.]*/velodyne") if next(p.glob("*.bin"), None))
     if not there:
         raw = any(re.search(r"_drive_\d+|^velodyne_points$", p.name) for p in (root, *root.glob("*"), *root.glob("*/*")))
-        raise FileNotFoundError(f"{root} has no sequences{', it is in the layout of KITTI raw data' if raw else ''}: expected "
-                                "ROOT/sequences/00/{velodyne/000000.bin, calib.txt} and ROOT/poses/00.txt, as KITTI's archives unpack.")
+        remedy = "check the path and unpack its archives"
+        if raw:
+            remedy = "convert KITTI's raw data with `python kitti.py raw DRIVE ROOT`"
+        raise FileNotFoundError(
+            f"{root} has no scans in a known layout: {remedy}. Known are a folder of *.bin or *.npy "
+            "files, and KITTI's odometry layout, ROOT/sequences/00/{velodyne/000000.bin, calib.txt} "
+            "and ROOT/poses/00.txt.")
     return there
 
 
 def open_sequences(root: str | Path, names: str | list[str] | None = None) -> list[Sequence]:
     """ROOT and names -> list of `Sequence`, in the order given, each once. A name is a folder under ROOT/sequences, a split of SPLITS (as
-    much of it as there is) or 'all'; None is 'all'. Raises ValueError for an unknown name or a split of which nothing is there, and whatever
-    `sequence_names` and `Sequence` raise."""
+    much of it as there is) or 'all'; None is 'all'. A ROOT without sequences/ is one `ScanFolder`.
+    Raises ValueError for an unknown name or a split of which nothing is there, and whatever
+    `sequence_names`, `Sequence` and `ScanFolder` raise."""
     there = sequence_names(root)
     choices = {split: [n for n in part if n in there] for split, part in SPLITS.items()} | {"all": there} | {n: [n] for n in there}
     names = ["all"] if names is None else [names] if isinstance(names, str) else list(names)
     for name in names:
         if not choices.get(name):
             raise ValueError(f"{root} has no sequence or split {name!r} with scans: there are {' '.join(n for n in choices if choices[n])}.")
-    return [Sequence(root, n) for n in dict.fromkeys(n for name in names for n in choices[name])]
+    chosen = dict.fromkeys(n for name in names for n in choices[name])
+    plain = not (Path(root) / "sequences").exists()
+    return [ScanFolder(root) if plain else Sequence(root, n) for n in chosen]
 
 
 # ------------------------------------------------------------------------------------------------ from a scan to a cloud
@@ -404,10 +540,10 @@ def cached_records(sequences, compute, dtype, settings, cache="cache"):
     files = [Path(cache) / f"{s.name}-{_cache_key(s, settings, dtype)}.npy" for s in sequences]
     missing = [(s, file) for s, file in zip(sequences, files) if not _is_intact(file, stored, len(s))]
     if missing:
-        paths = [path for s, _ in missing for path in s.scan_paths]
+        tasks = [(path, s.intensity_max) for s, _ in missing for path in s.scan_paths]
         row_of = functools.partial(_cache_row, compute=compute, dtype=stored)
-        with closing(in_processes(row_of, paths)) as rows:
-            rows = progress(rows, len(paths), "sampling and grouping, scans")
+        with closing(in_processes(row_of, tasks)) as rows:
+            rows = progress(rows, len(tasks), "sampling and grouping, scans")
             for s, file in missing:
                 header = {"descr": np.lib.format.dtype_to_descr(stored), "fortran_order": False, "shape": (len(s),)}
                 with replacing(file) as temporary, open(temporary, "wb") as out:  # a memory map would crash on a full disk
@@ -423,13 +559,14 @@ def _cache_key(sequence, settings, dtype):
     """Hash of all that a cache file depends on. The change time (ctime) notices what keeps size and modification time."""
     stats = [os.stat(path) for path in sequence.scan_paths]
     scans = [(s.st_size, s.st_mtime_ns, s.st_ctime_ns) for s in stats]
-    depends = str(sequence.folder.resolve()), scans, settings, dtype.descr
+    depends = str(sequence.folder.resolve()), scans, sequence.intensity_max, settings, dtype.descr
     return hashlib.sha256(repr(depends).encode()).hexdigest()[:16]
 
 
-def _cache_row(path, compute, dtype):
-    """One scan file -> the bytes of its row in a cache file."""
-    scan, row = read_scan(path), np.zeros((), dtype)
+def _cache_row(task, compute, dtype):
+    """A scan file and its `intensity_max` -> the bytes of its row in a cache file."""
+    path, intensity_max = task
+    scan, row = read_scan(path, intensity_max), np.zeros((), dtype)
     row["scan_crc"] = zlib.crc32(scan)
     try:
         row["record"] = compute(scan)
@@ -457,6 +594,171 @@ def fingerprint(sequence, scan_crcs):
     """16 hex digits that identify the data of a sequence, wherever they lie: the CRC of every scan, and the poses."""
     poses = b"" if sequence.poses_cam is None else sequence.poses_cam.tobytes()
     return hashlib.sha256(scan_crcs.tobytes() + poses).hexdigest()[:16]
+
+
+# ------------------------------------------------------------------------------ KITTI's raw drives
+# Files and columns: readme.txt of the raw data devkit, and oxts/dataformat.txt of each drive.
+EARTH_RADIUS = 6378137.0  # m, devkit: latlonToMercator.m
+LAT_LON_ALT, ROLL_PITCH_YAW = slice(0, 3), slice(3, 6)  # columns of a packet: degrees, m; radians
+VELOCITY, TURN_RATE = [7, 6, 10], slice(17, 20)  # m/s east, north, up; rad/s around its x, y and z
+NEAR = np.timedelta64(100, "ms")  # without a packet as near as that a scan has no pose
+
+
+def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int]]:
+    """Convert an unpacked "sync" drive of KITTI's raw data to odometry layout, with ground truth.
+
+    `drive` is a folder such as 2011_09_26/2011_09_26_drive_0013_sync, with the date's calib_*.txt
+    in its parent folder. Writes the folder ROOT/sequences/2011_09_26_drive_0013 and the ground
+    truth ROOT/poses/2011_09_26_drive_0013.txt, in the rectified left camera's frame. Scans are hard
+    links where the file system allows it, else copies. A drive in which scans are missing is split
+    at the gaps, into sequences with -1, -2 ... behind their names. Returns {name of a sequence:
+    (number of its first scan in the drive, of its last)}.
+
+    A pose is that of the time in velodyne_points/timestamps.txt: the middle of the scanner's turn,
+    when it faces forward and triggers the cameras, which is what the "sync" data is aligned to. The
+    GPS/IMU packet of a scan was recorded at another time, 12 to 25 ms later in drive 0013. So the
+    nearest packet is moved by its own velocity and turn rate to the time of the scan. The points
+    are used as they are: those of a turn were measured over 0.1 s.
+
+    Raises FileNotFoundError for a missing file, naming its archive, and ValueError for a damaged
+    one or when ROOT holds such a sequence already. ROOT is then unchanged.
+    """
+    drive, root = Path(drive), Path(root)
+    name = re.fullmatch(r"((\d{4}_\d\d_\d\d)_drive_\d+)_sync", drive.resolve().name)
+    if not name:
+        raise ValueError(f"{drive} is no drive of KITTI's raw data: give a folder such as "
+                         "2011_09_26/2011_09_26_drive_0013_sync, of the synced+rectified data.")
+    name, date = name.groups()
+    numbers, scans, times = _raw_stream(drive / "velodyne_points", ".bin", f"{name}_sync.zip")
+    _, packets, packet_times = _raw_stream(drive / "oxts", ".txt", f"{name}_sync.zip")
+    Tr, T_velo_imu = _raw_calib(drive.resolve().parent, f"{date}_calib.zip")
+    for path in scans:
+        _check_scan_size(path, path.stat().st_size)
+
+    # the nearest packet of each scan, then the scans in runs without a gap
+    nearest = np.array([np.abs(packet_times - time).argmin() for time in times])
+    late = times - packet_times[nearest]
+    has_pose = np.flatnonzero(np.abs(late) < NEAR)
+    if not len(has_pose):
+        raise ValueError(f"{drive}: no scan was taken within 0.1 s of a GPS/IMU packet; "
+                         f"unpack {name}_sync.zip again.")
+    runs = np.split(has_pose, np.flatnonzero(np.diff(numbers[has_pose]) != 1) + 1)
+    parts = {name if len(runs) == 1 else f"{name}-{i}": run for i, run in enumerate(runs, 1)}
+    packets = np.stack([_read_packet(path) for path in packets])  # (m,30)
+    T_imu = _imu_poses(packets, nearest, late / np.timedelta64(1, "s"))  # (n,4,4)
+
+    folders = {part: root / "sequences" / part for part in parts}
+    for path in (*folders.values(), *(root / "poses" / f"{part}.txt" for part in parts)):
+        if path.exists():
+            raise ValueError(f"{path} is there already: remove it or choose another ROOT.")
+    temporary = {part: temporary_beside(folder) for part, folder in folders.items()}
+    try:
+        for part, run in parts.items():
+            _write_raw_sequence(temporary[part], [scans[i] for i in run], Tr, times[run])
+        for part, run in parts.items():
+            T = invert(T_imu[run[0]]) @ T_imu[run]
+            T_cam = velo_to_camera(T, Tr @ T_velo_imu)  # from the IMU's frame to the camera's
+            write_poses(root / "poses" / f"{part}.txt", T_cam)
+            temporary[part].rename(folders[part])
+    finally:
+        for folder in temporary.values():
+            shutil.rmtree(folder, ignore_errors=True)
+    return {part: (int(numbers[run[0]]), int(numbers[run[-1]])) for part, run in parts.items()}
+
+
+def _write_raw_sequence(folder, scans, Tr, times):
+    """The files of a sequence in odometry layout but its poses."""
+    shutil.rmtree(folder, ignore_errors=True)  # of an earlier process of the same number
+    (folder / "velodyne").mkdir(parents=True)
+    for i, scan in enumerate(progress(scans, len(scans), "linking or copying scans")):
+        target = folder / "velodyne" / f"{i:06d}.bin"
+        try:
+            os.link(scan.resolve(), target)
+        except OSError:  # another file system, or one without links
+            shutil.copyfile(scan, target)
+    seconds = (times - times[0]) / np.timedelta64(1, "s")
+    (folder / "calib.txt").write_text(f"Tr: {' '.join(f'{x:.12e}' for x in Tr[:3].ravel())}\n")
+    (folder / "times.txt").write_text("".join(f"{t:.6f}\n" for t in seconds))
+
+
+def _require(path, archive):
+    """Raises FileNotFoundError when a file of KITTI's is missing."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist: it is in {archive}.")
+
+
+def _raw_stream(folder, suffix, archive):
+    """The files of a stream that have a time: numbers (n,), paths (list), times (n,).
+
+    Line i of timestamps.txt, from 0, is the time of file i, to the nanosecond. It is blank where
+    the recording has lost a file, as in drive 2011_09_26_drive_0009.
+    """
+    stamps = folder / "timestamps.txt"
+    paths = sorted(path for path in folder.glob(f"data/*{suffix}") if path.stem.isdecimal())
+    _require(stamps, archive)
+    _require(paths[0] if paths else folder / "data" / f"0000000000{suffix}", archive)
+    numbers = np.array([int(path.stem) for path in paths])
+    try:
+        lines = [line.strip() for line in stamps.read_text().splitlines()]
+        times = np.array(lines, "datetime64[ns]")[numbers]  # a blank line becomes NaT
+    except (ValueError, IndexError):
+        times = np.full(len(paths), np.datetime64("NaT"))
+    known = np.flatnonzero(~np.isnat(times))
+    if not len(known):
+        raise ValueError(f"{stamps} is damaged: line i should hold the time of file i, such as "
+                         f"2011-09-26 13:10:51.158069617; unpack {archive} again.")
+    return numbers[known], [paths[i] for i in known], times[known]
+
+
+def _read_packet(path):
+    """A GPS/IMU packet, (30,) numbers in the order of oxts/dataformat.txt."""
+    try:
+        packet = np.array(path.read_bytes().split(), dtype=float).reshape(30)
+    except ValueError:
+        packet = np.full(30, np.nan)
+    if not np.isfinite(packet).all():
+        raise ValueError(f"{path} is damaged: a GPS/IMU packet is 30 finite numbers; "
+                         "unpack the drive again.")
+    return packet
+
+
+def _raw_calib(folder, archive):
+    """The calib_*.txt of a date -> Tr (4,4), from Velodyne to rectified camera, and T_velo_imu."""
+    def transform(name, rotation, translation=None):
+        path = folder / name
+        _require(path, archive)
+        t = _calib_row(path, translation, 3) if translation else np.zeros(3)
+        row = np.c_[_calib_row(path, rotation, 9).reshape(3, 3), t]
+        if not _is_rigid(row):
+            raise ValueError(f"{path} is damaged: its row {rotation!r} should hold a rotation, "
+                             f"and 'T' a translation; unpack {archive} again.")
+        return np.vstack([row, [0, 0, 0, 1]])
+    rectify = transform("calib_cam_to_cam.txt", "R_rect_00")
+    return (rectify @ transform("calib_velo_to_cam.txt", "R", "T"),
+            transform("calib_imu_to_velo.txt", "R", "T"))
+
+
+def _imu_poses(packets, nearest, late):
+    """Poses T_wi (n,4,4) of the GPS/IMU unit (x forward, y left, z up), `late` (n,) seconds after
+    the packets `nearest` (n,) of all (m,30). The world is x east, y north, z up, in metres.
+
+    The pose of a packet is that of the devkit's convertOxtsToPose.m: a Mercator projection with
+    the scale of the drive's first latitude, and roll, pitch, yaw about x, y, z in that order.
+    Velocity and turn rate are constant from there: the unit moves along an arc, and the chord of
+    the arc has the direction of the velocity half-way.
+    """
+    scale = EARTH_RADIUS * np.cos(np.radians(packets[0, 0]))
+    packets, late = packets[nearest], late[:, None]
+    lat, lon, alt = packets[:, LAT_LON_ALT].T
+    east, north = scale * np.radians(lon), scale * np.log(np.tan(np.radians(90 + lat) / 2))
+    position = np.stack([east, north, alt], axis=1)  # (n,3)
+    attitude = Rotation.from_euler("xyz", packets[:, ROLL_PITCH_YAW])
+    turn = attitude.apply(packets[:, TURN_RATE]) * late  # (n,3) rotation vectors, world's axes
+    half_way = Rotation.from_rotvec(turn / 2)
+    T = np.tile(np.eye(4), (len(packets), 1, 1))
+    T[:, :3, :3] = (Rotation.from_rotvec(turn) * attitude).as_matrix()
+    T[:, :3, 3] = position + half_way.apply(packets[:, VELOCITY] * late)
+    return T
 
 
 # ---------------------------------------------------------------------------------------------------- the simulated city
@@ -923,17 +1225,26 @@ def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range
 def main(argv=None):
     """The command line -> exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("command", choices=["simulate"])
-    parser.add_argument("dir", metavar="DIR", help="where to")
-    parser.add_argument("--seed", type=int, metavar="N", default=0, help="another seed, other cities (default: 0)")
-    parser.add_argument("--sequences", nargs="+", metavar="NN", default=["all"], help="names, or train, test, validation, all (default)")
-    parser.add_argument("--scans", type=int, metavar="N", help="scans per sequence (default: 170 for test and validation, else 320)")
-    parser.add_argument("--azimuth", type=int, metavar="N", default=1800, help="rays per beam and turn (default: 1800)")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="simulate | raw")
+    s = commands.add_parser("simulate", help="make simulated drives, with ground truth")
+    s.add_argument("dir", metavar="DIR", help="where to")
+    s.add_argument("--seed", type=int, metavar="N", default=0, help="another seed, other cities (default: 0)")
+    s.add_argument("--sequences", nargs="+", metavar="NN", default=["all"], help="names, or train, test, validation, all (default)")
+    s.add_argument("--scans", type=int, metavar="N", help="scans per sequence (default: 170 for test and validation, else 320)")
+    s.add_argument("--azimuth", type=int, metavar="N", default=1800, help="rays per beam and turn (default: 1800)")
+    r = commands.add_parser("raw", help="convert a drive of KITTI's raw data, with ground truth")
+    r.add_argument("drive", metavar="DRIVE",
+                   help="unpacked folder such as 2011_09_26/2011_09_26_drive_0013_sync")
+    r.add_argument("dir", metavar="ROOT", help="where to, in KITTI's odometry layout")
     args = parser.parse_args(argv)
     terminate_as_interrupted()
     try:
-        simulate(args.dir, args.seed, args.sequences, args.scans, args.azimuth)
-        made = open_sequences(args.dir, args.sequences)
+        if args.command == "raw":
+            parts = convert_raw(args.drive, args.dir)
+            made = open_sequences(args.dir, list(parts))
+        else:
+            simulate(args.dir, args.seed, args.sequences, args.scans, args.azimuth)
+            made = open_sequences(args.dir, args.sequences)
     except (ValueError, OSError) as error:
         print(f"kitti.py: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
@@ -941,6 +1252,11 @@ def main(argv=None):
         print("kitti.py: interrupted; sequences that are complete stay, run the same command again for the rest.", file=sys.stderr)
         return 130
     print(f"{args.dir}: {len(made)} sequences, {sum(map(len, made)):,} scans")
+    if args.command == "raw":
+        for s, (first, last) in zip(made, parts.values()):
+            print(f"{s.name}: scans {first} to {last}, {path_lengths(s.poses)[-1]:.1f} m")
+        if len(made) > 1:
+            print("The drive is split where scans or their GPS/IMU packets are missing.")
     return 0
 
 

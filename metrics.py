@@ -191,17 +191,38 @@ def picture(width, height):
     return Figure(figsize=(width, height), layout="constrained")
 
 
+def view_from_above(T: np.ndarray) -> tuple[np.ndarray, str, str]:
+    """How to draw poses (n,4,4) from above: a matrix (2,3) and the labels of the two axes.
+
+    The matrix maps positions to metres right and forward. The frame is found from the mean step,
+    each step in its own frame: a vehicle moves along z in a camera's frame (x right, y down,
+    z forward) and along x in a LiDAR's (x forward, y left, z up). Without any motion the frame
+    is taken to be the camera's, as in KITTI's pose files.
+    """
+    steps = np.linalg.inv(T[:-1]) @ T[1:]
+    x, y, z = steps[:, :3, 3].sum(axis=0)               # the direction of the mean
+    if abs(z) >= np.hypot(x, y):
+        return np.array([[1, 0, 0], [0, 0, 1]]), "camera x, right [m]", "camera z, forward [m]"
+    return np.array([[0, -1, 0], [1, 0, 0]]), "LiDAR -y, right [m]", "LiDAR x, forward [m]"
+
+
 def draw(path, trajectories):
-    """{name: (T_gt or None, T_est)} in KITTI's camera frame -> a PNG, for each name a row: the path from above, and KITTI's errors by the
-    length of the segments. ValueError without matplotlib."""
-    figure = picture(10.5, 3.1 * len(trajectories))
-    rows = figure.subplots(len(trajectories), 3, squeeze=False)
+    """{name: (T_gt or None, T_est)}, poses (n,4,4) in a camera's or a LiDAR's frame -> a PNG.
+
+    Each name is a row: the path from above and, if there is any ground truth, KITTI's errors by the
+    length of the segments. Raises ValueError without matplotlib.
+    """
+    columns = 3 if any(T_gt is not None for T_gt, _ in trajectories.values()) else 1
+    figure = picture(3.5 * columns, 3.1 * len(trajectories))
+    rows = figure.subplots(len(trajectories), columns, squeeze=False)
     for (name, (T_gt, T_est)), (above, *errors) in zip(trajectories.items(), rows):
+        view, right, forward = view_from_above(T_est if T_gt is None else T_gt)
         for T, style in (T_gt, dict(color="0.65", lw=4, label="truth")), (T_est, dict(color="black", lw=1.2, label="estimate")):
             if T is not None:
-                above.plot(T[:, 0, 3], T[:, 2, 3], **style)  # KITTI's camera: x right, z forward
+                above.plot(*view @ T[:, :3, 3].T, **style)
         above.plot(0, 0, "ko", ms=5)
-        above.set(title=f"{name} from above, from the dot", xlabel="x [m]", ylabel="z [m]", aspect="equal", adjustable="datalim")
+        above.set(title=f"{name} from above, from the dot", xlabel=right, ylabel=forward,
+                  aspect="equal", adjustable="datalim")
         above.legend(frameon=False)
         lengths = by_length([] if T_gt is None else [segment_errors(T_gt, T_est)])
         for axis, error, unit in zip(errors, ("E_t", "E_r"), ("%", "deg/m")):

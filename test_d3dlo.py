@@ -781,6 +781,42 @@ def test_pose_files_survive_the_round_trip(tmp_path, seed, n):
     assert os.listdir(path.parent) == ["a.txt"] and np.loadtxt(path, ndmin=2).shape == (n, 12)
 
 
+@given(SEED, st.sampled_from([0, 1e-9, 1e-4, 1, 179.9999, 180]))
+def test_tum_files_hold_times_positions_and_unit_quaternions(tmp_path, seed, degrees):
+    rng = generator(seed)
+    axes = np.r_[rng.normal(size=(4, 3)), np.eye(3), -np.eye(3)]    # also x, y and z
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    T = motion(rng, n=len(axes))
+    T[:, :3, :3] = Rotation.from_rotvec(np.radians(degrees) * axes).as_matrix()
+    times = 1.3e9 + np.cumsum(rng.uniform(0.05, 0.2, len(T)))    # seconds since 1970
+    kitti.write_tum(tmp_path / "a.tum", T, times)
+    rows = np.loadtxt(tmp_path / "a.tum")
+    assert rows.shape == (len(T), 8) and os.listdir(tmp_path) == ["a.tum"]
+    assert_allclose(rows[:, 0], times, rtol=0, atol=1e-6)
+    assert_allclose(rows[:, 1:4], T[:, :3, 3], atol=1e-8)
+    assert_allclose(np.linalg.norm(rows[:, 4:], axis=1), 1, atol=1e-8)
+    assert_allclose(Rotation.from_quat(rows[:, 4:]).as_matrix(), T[:, :3, :3], atol=1e-8)
+    assert (rows[:, 7] >= 0).all()
+    with pytest.raises(ValueError):
+        kitti.write_tum(tmp_path / "b.tum", T, times[:-1])
+    assert os.listdir(tmp_path) == ["a.tum"]
+
+
+@given(SEED, st.sampled_from([-1, 1]))
+def test_a_path_from_above_is_the_same_in_the_camera_s_and_the_lidar_s_frame(seed, gear):
+    rng = generator(seed)
+    signs = [gear, *rng.choice([-1, 1], 5)]             # forwards or in reverse
+    steps = np.abs(rng.normal(size=(50, 6))) * [1, 0.05, 0.05, 1, 1, 6] * signs
+    lidar = d3dlo.accumulate(from_vector(steps))
+    Tr = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])   # in the same place
+    camera = kitti.velo_to_camera(lidar, Tr)
+    for T, labels in ((lidar, ["LiDAR -y, right [m]", "LiDAR x, forward [m]"]),
+                      (camera, ["camera x, right [m]", "camera z, forward [m]"])):
+        view, *named = metrics.view_from_above(T)
+        assert named == labels
+        assert_allclose(view @ T[:, :3, 3].T, [-lidar[:, 1, 3], lidar[:, 0, 3]], atol=1e-9)
+
+
 # ------------------------------------------------------------------------------------------------------------------ data
 
 @given(SEED, st.floats(-8, 8), st.floats(-8, 8))
@@ -872,7 +908,7 @@ def test_simulated_test_drives_are_long_and_winding_enough_to_be_measured(tmp_pa
 def test_real_scans_are_sampled_exactly_and_lose_their_ground():
     for s in kitti.open_sequences(KITTI):
         scan = s.scan(len(s) // 2)
-        assert_array_equal(farthest_point_sampling(scan[:, :3], 128), fps_brute(scan[:, :3], 128))
+        assert_array_equal(farthest_point_sampling(scan[:, :3], 128), fps_textbook(scan[:, :3], 128))
         assert 0.25 < 1 - len(kitti.remove_plane(scan)) / len(scan) < 0.65
 
 
@@ -887,6 +923,137 @@ def write_root(root, names=("00",), scans=6, size=1100, step=1.0):
         (folder / "calib.txt").write_text(f"P0: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: {' '.join(map(repr, Tr[:3].ravel().tolist()))}\n")
         metrics.write_poses(root / "poses" / f"{name}.txt", trajectory(rng, scans, np.array([step, 0.1, 0.1, 0.3, 0.3, 1])))
     return root
+
+
+def write_folder(folder, scans=12, size=50, save=np.save, name="scan {}.npy", scale=1, columns=4):
+    """A plain folder of random scans, numbered from 1 -> the scans."""
+    rng = generator(0)
+    folder.mkdir()
+    factors = np.float32([1, 1, 1, scale])
+    made = [(cloud(rng, size) * factors)[:, :columns] for _ in range(scans)]
+    for i, scan in enumerate(made, 1):
+        save(folder / name.format(i), scan)
+    return made
+
+
+def save_bin(path, scan):
+    scan.tofile(path)
+
+
+@table("save, name", {"bin": (save_bin, "{}.pcd.bin"), "npy": (np.save, "scan-{}-of-12.npy")})
+def test_a_folder_of_scans_is_one_sequence_in_natural_order(tmp_path, save, name):
+    scans = write_folder(tmp_path / "drive", save=save, name=name)
+    (tmp_path / "drive" / "._1.bin").write_text("left by another system")
+    (tmp_path / "drive" / "notes.txt").write_text("not a scan")
+    s, = kitti.open_sequences(tmp_path / "drive")
+    assert kitti.sequence_names(tmp_path / "drive") == [s.name] == ["drive"] and len(s) == 12
+    for i, scan in enumerate(scans):                    # 2 comes before 10
+        assert s.scan(i).dtype == np.float32
+        assert_array_equal(s.scan(i), scan)
+    assert s.Tr is None and s.poses is None and s.poses_cam is None
+    with pytest.raises(ValueError, match="drive has no ground truth"):
+        s.motions()
+    with pytest.raises(ValueError, match="'00'.*drive"):
+        kitti.open_sequences(tmp_path / "drive", ["00"])
+
+
+def test_times_of_a_folder_are_those_of_its_file_or_of_ten_scans_a_second(tmp_path):
+    write_folder(tmp_path / "drive")
+    s, = kitti.open_sequences(tmp_path / "drive")
+    assert_allclose(s.times, np.arange(12) / 10)
+    assert "10 scans a second" in " ".join(s.notes)
+    times = 1.3e9 + np.arange(12) * 0.25
+    np.savetxt(tmp_path / "drive" / "times.txt", times, fmt="%.6f")
+    s, = kitti.open_sequences(tmp_path / "drive")
+    assert_allclose(s.times, times, rtol=0, atol=1e-6)
+    assert s.notes == []
+
+
+@pytest.mark.parametrize("scale, columns, divisor, words", [
+    (0.9, 4, 1, ""), (255, 4, 255, "255"), (2, 4, 255, "255"),
+    (1, 3, 1, "no intensities"), (0, 4, 1, "no intensities")])
+def test_intensities_of_a_folder_are_brought_to_0_to_1(tmp_path, scale, columns, divisor, words):
+    scans = write_folder(tmp_path / "drive", scale=scale, columns=columns)
+    (tmp_path / "drive" / "times.txt").write_text("\n".join(map(str, range(12))))
+    s, = kitti.open_sequences(tmp_path / "drive")
+    for i, scan in enumerate(scans):
+        intensity = scan[:, 3] / np.float32(divisor) if columns == 4 else np.zeros(50)
+        assert_array_equal(s.scan(i), np.c_[scan[:, :3], intensity])
+    assert len(s.notes) == bool(words) and words in "".join(s.notes)
+
+
+def test_ten_scans_spread_over_a_folder_decide_on_the_intensities_of_all(tmp_path):
+    scans = write_folder(tmp_path / "drive", scans=37)
+    looked_at = set(range(0, 37, 4))    # 10 of 37, the first and the last among them
+    for bright in range(37):
+        path = tmp_path / "drive" / f"scan {bright + 1}.npy"
+        np.save(path, scans[bright] * np.float32([1, 1, 1, 200]))
+        s, = kitti.open_sequences(tmp_path / "drive")
+        assert s.intensity_max == (255 if bright in looked_at else 1)
+        assert_array_equal(s.scan(5)[:, 3], np.load(s.scan_paths[5])[:, 3] / s.intensity_max)
+        np.save(path, scans[bright])
+
+
+def test_a_scan_cut_short_is_named_before_any_work_begins(tmp_path):
+    write_folder(tmp_path / "drive", scans=37, save=save_bin, name="{}.bin")
+    for i in range(1, 38):                              # not only those that are looked into
+        whole = (tmp_path / "drive" / f"{i}.bin").read_bytes()
+        (tmp_path / "drive" / f"{i}.bin").write_bytes(whole[:-1])
+        with pytest.raises(ValueError, match=f"/{i}.bin has 799 bytes"):
+            kitti.open_sequences(tmp_path / "drive")
+        (tmp_path / "drive" / f"{i}.bin").write_bytes(whole)
+
+
+def save_as(name, array):
+    return lambda folder: np.save(folder / name, array, allow_pickle=True)
+
+
+def write_as(name, text):
+    return lambda folder: (folder / name).write_text(text)
+
+
+def five_floats(points):
+    """Scans as nuScenes': x, y, z, intensity up to 255 and the number of the beam."""
+    def spoil(folder):
+        for path in list(folder.iterdir()):
+            scan = cloud(generator(1), points) * np.float32([1, 1, 1, 255])
+            np.c_[scan, np.arange(points) % 32].astype(np.float32).tofile(path.with_suffix(".bin"))
+            path.unlink()
+    return spoil
+
+
+class Mischief:
+    def __reduce__(self):
+        return os.mkdir, ("mischief",)
+
+
+@table("spoil, words", {       # what is done to a good folder of scans; what the message must name
+    "nuScenes": (five_floats(52), ("1.bin", "reshape(-1, 5)[:, :4]", "nuScenes")),
+    "nuScenes, of an odd size": (five_floats(51), ("1.bin", "reshape(-1, 5)[:, :4]", "nuScenes")),
+    "16 bits": (save_as("scan 1.npy", np.full((9, 4), 300)), ("scan 1.npy", "300", "rescale")),
+    "negative": (save_as("scan 12.npy", np.full((9, 4), -0.5)), ("scan 12.npy", "-0.5")),
+    "two kinds": (lambda folder: (folder / "0.bin").write_bytes(b"0" * 16), ("drive", ".npy")),
+    "five columns": (save_as("scan 1.npy", np.ones((9, 5))), ("scan 1.npy", "(9, 5)")),
+    "no points": (save_as("scan 1.npy", np.ones((0, 4))), ("scan 1.npy", "(0, 4)")),
+    "words": (save_as("scan 1.npy", np.full((9, 4), "x")), ("scan 1.npy", "numbers")),
+    "an archive": (lambda folder: np.savez(open(folder / "scan 1.npy", "wb"), np.ones((9, 4))),
+                   ("scan 1.npy", "(N,4)")),
+    "a damaged file": (write_as("scan 1.npy", "damaged"), ("scan 1.npy", "damaged")),
+    "an empty file": (write_as("scan 1.npy", ""), ("scan 1.npy", "damaged")),
+    "code": (save_as("scan 1.npy", np.array([Mischief()])), ("scan 1.npy", "damaged")),
+    "a time too few": (write_as("times.txt", "1 2 3"), ("times.txt", "12")),
+    "times that go back": (write_as("times.txt", "1 2 3 4 5 6 7 8 9 10 11 0"), ("increasing",)),
+    "times that are dates": (write_as("times.txt", "2011-09-26 " * 12), ("times.txt", "seconds")),
+})
+def test_a_folder_that_is_no_drive_is_refused_in_one_line(here, spoil, words):
+    write_folder(here / "drive")
+    spoil(here / "drive")
+    before = files_of(here)
+    with pytest.raises(ValueError) as refused:
+        kitti.open_sequences(here / "drive")
+    message = str(refused.value)
+    assert all(word in message for word in words) and "\n" not in message, message
+    assert files_of(here) == before and not (here / "mischief").exists()
 
 
 def test_the_cache_holds_what_scan_geometry_says_and_is_made_anew_when_anything_changes(tmp_path):
@@ -1132,6 +1299,51 @@ def test_eval_writes_what_it_prints_and_metrics_agrees_and_zips_what_the_server_
             assert archive.read(name) == Path("out", name).read_bytes() and np.loadtxt(archive.open(name)).shape == (2, 12)
 
 
+@pytest.mark.parametrize("save, name, scale", [(save_bin, "{}.bin", 1), (np.save, "{}.npy", 255)])
+def test_eval_takes_a_plain_folder_of_scans(here, weights, capsys, save, name, scale):
+    scans = write_folder(here / "drive", size=1100, save=save, name=name, scale=scale)
+    arguments = ["eval", "--data", "drive", "--weights", str(weights), "--out"]
+    assert d3dlo.main([*arguments, "out"]) == 0
+    (out, err), (net, _) = capsys.readouterr(), load_weights(weights)
+    scans = [scan / np.float32([1, 1, 1, scale]) for scan in scans]
+    expected = d3dlo.accumulate([from_vector(predict(net, p, q)) for p, q in zip(scans, scans[1:])])
+    poses, rows = metrics.read_poses("out/poses.txt"), np.loadtxt("out/poses.tum")
+    assert sorted(os.listdir("out")) == ["poses.tum", "poses.txt", "results.json"]
+    assert_allclose(poses, expected, rtol=1e-3, atol=1e-3)
+    assert_allclose(rows[:, 0], np.arange(12) / 10)
+    assert_allclose(rows[:, 1:4], poses[:, :3, 3], atol=1e-6)
+    assert_allclose(Rotation.from_quat(rows[:, 4:]).as_matrix(), poses[:, :3, :3], atol=1e-6)
+    metres, speed = re.search(r"^drive: 12 scans, path of (\S+) m, (\S+) scans a second", out).groups()
+    assert float(metres) == pytest.approx(metrics.path_lengths(poses)[-1], abs=0.06)
+    assert float(speed) > 0 and complaint(err) == []
+    assert "frame         of the LiDAR" in out and "out/poses.txt" in out and "out/poses.tum" in out
+    assert "10 scans a second" in out and ("divided by 255" in out) == (scale > 1)
+    (here / "drive" / "times.txt").write_text("\n".join(f"{7 + i}" for i in range(12)))
+    assert d3dlo.main([*arguments, "again"]) == 0
+    assert_allclose(np.loadtxt("again/poses.tum"), np.c_[7 + np.arange(12), rows[:, 1:]], atol=1e-8)
+    assert "10 scans" not in capsys.readouterr().out
+
+
+def test_a_plain_folder_is_drawn_where_there_is_matplotlib(here, weights, capsys):
+    pytest.importorskip("matplotlib")
+    write_folder(here / "drive", scans=3, size=1100)
+    arguments = ["eval", "--data", "drive", "--weights", str(weights), "--out", "out", "--plot"]
+    assert d3dlo.main(arguments) == 0 and "out/plot.png" in capsys.readouterr().out
+    assert (here / "out" / "plot.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_plain_folder_that_cannot_be_used_is_named_in_one_line(here, weights, capsys):
+    write_folder(here / "drive", size=1100)
+    train = ["train", "--data", "drive", "--out", "run"]
+    evaluate = ["eval", "--data", "drive", "--weights", weights, "--out", "out"]
+    fails_with_one_line(d3dlo.main, train, "drive has no ground truth", capsys)
+    np.save(here / "drive" / "scan 2.npy", cloud(generator(0), 900))
+    fails_with_one_line(d3dlo.main, evaluate, "scan 2.npy: 900 usable", capsys)
+    five_floats(52)(here / "drive")
+    fails_with_one_line(d3dlo.main, evaluate, "nuScenes", capsys)
+    assert all(name.startswith("drive/") for name in files_of(here))    # nothing is left
+
+
 def test_train_then_eval_then_train_again(here, city, capsys):
     arguments = ["train", "--data", shutil.copytree(city, "data"), "--epochs", "1", "--out", "run"]
     assert d3dlo.main(arguments) == 0
@@ -1219,8 +1431,10 @@ SCAN, POSES, CALIB = "sequences/00/velodyne/000005.bin", "poses/00.txt", "sequen
 
 
 @table("spoil, words", {        # what is done to a good root, and what the complaint must name
-    "no sequences": (lambda root: shutil.rmtree(root / "sequences"), "sequences/"),
-    "raw layout": (lambda root: (root / "sequences").rename(root / "2011_09_26_drive_0005_sync"), "raw data"),
+    "no sequences": (lambda root: shutil.rmtree(root / "sequences"),
+                     "a folder of *.bin or *.npy files, and KITTI's odometry layout, ROOT/sequences/00/"),
+    "raw layout": (lambda root: (root / "sequences").rename(root / "2011_09_26_drive_0005_sync"),
+                   "kitti.py raw DRIVE ROOT"),
     "no scans": (lambda root: shutil.rmtree((root / SCAN).parent), "velodyne"),
     "a scan missing": (lambda root: (root / SCAN).with_name("000002.bin").unlink(), "000002.bin"),
     "a scan cut short": (rewrite(SCAN, lambda b: b[:-3]), SCAN),
@@ -1258,11 +1472,6 @@ def test_bad_arguments_are_named_in_one_line(here, capsys, arguments, words):
     before = sorted(here.rglob("*"))
     fails_with_one_line(d3dlo.main, arguments.split(), words, capsys)
     assert sorted(here.rglob("*")) == before
-
-
-class Mischief:
-    def __reduce__(self):
-        return os.mkdir, ("mischief",)
 
 
 def torch_bytes(content):
@@ -1316,6 +1525,163 @@ def test_simulate_on_the_command_line(here, city, capsys):
     assert files_of(here) == before and not list(here.rglob(".*"))
 
 
+DRIVE = "2011_09_26/2011_09_26_drive_0013_sync"
+
+
+def imu_pose(t):
+    """T_wi (4,4) of the vehicle of `write_raw` after t seconds: 12 m/s on a climbing bend."""
+    yaw, radius = 0.4 + 0.3 * t, 12 / 0.3
+    position = [radius * np.sin(yaw), -radius * np.cos(yaw), 100 + 0.5 * t]    # east, north, up
+    return by_hand(np.r_[position, np.degrees([0.03, 0.05, yaw])])
+
+
+def write_raw(folder, scans=12):
+    """A drive as KITTI's raw data -> true poses of the rectified camera (scans,4,4), Tr (4,4)."""
+    rng, drive = generator(0), folder / DRIVE
+    times = {"velodyne_points": 0.1 * np.arange(scans) + rng.uniform(-0.004, 0.004, scans)}
+    times["oxts"] = times["velodyne_points"] + 0.015 + rng.uniform(-0.01, 0.01, scans)
+    for stream, seconds in times.items():
+        (drive / stream / "data").mkdir(parents=True)
+        stamps = np.datetime64("2011-09-26T23:59:59.5", "ns") + (1e9 * seconds).astype(int)
+        lines = [f"{stamp}\n".replace("T", " ") for stamp in stamps]                # past midnight
+        (drive / stream / "timestamps.txt").write_text("".join(lines))
+    T_oxts = [imu_pose(t) for t in times["oxts"]]
+    scale = 6378137 * np.cos(np.radians(49))            # of Mercator at the first packet's latitude
+    for i, (t, T) in enumerate(zip(times["oxts"], T_oxts)):
+        cloud(rng, 40).tofile(drive / "velodyne_points" / "data" / f"{i:010d}.bin")
+        east, north, up = T[:3, 3] - T_oxts[0][:3, 3]
+        stretched = np.arctanh(np.sin(np.radians(49))) + north / scale              # Mercator's y
+        lat, lon = np.degrees(np.arcsin(np.tanh(stretched))), 8.4 + np.degrees(east / scale)
+        yaw = 0.4 + 0.3 * t
+        packet = np.full(30, 77.0)                      # what is not used
+        packet[:11] = lat, lon, up, 0.03, 0.05, yaw, 12 * np.sin(yaw), 12 * np.cos(yaw), 77, 77, 0.5
+        packet[17:20] = T[:3, :3].T @ [0, 0, 0.3]       # the vehicle's own axes
+        np.savetxt(drive / "oxts" / "data" / f"{i:010d}.txt", packet[None], fmt="%.17g")
+    T_velo_imu = motion(rng)
+    T_cam_velo = by_hand(np.array([0, -0.1, -0.3, -90, 1, -91]))
+    rectify = by_hand(np.array([0, 0, 0, 1, 2, 3.0]))
+    numbers = lambda array: " ".join(map(repr, array.ravel().tolist()))
+    for name, T in ("imu_to_velo", T_velo_imu), ("velo_to_cam", T_cam_velo):
+        (drive.parent / f"calib_{name}.txt").write_text(
+            f"calib_time: 25-May-2012\nR: {numbers(T[:3, :3])}\nT: {numbers(T[:3, 3])}\n")
+    (drive.parent / "calib_cam_to_cam.txt").write_text(
+        f"R_00: {numbers(np.eye(3))}\nR_rect_00: {numbers(rectify[:3, :3])}\n")
+    T_imu_cam = np.linalg.inv(rectify @ T_cam_velo @ T_velo_imu)
+    T_wc = [imu_pose(t) @ T_imu_cam for t in times["velodyne_points"]]
+    return np.linalg.inv(T_wc[0]) @ T_wc, rectify @ T_cam_velo
+
+
+def test_a_raw_drive_is_converted_with_poses_of_the_time_of_its_scans(here, capsys):
+    truth, Tr = write_raw(here)
+    assert kitti.main(["raw", DRIVE, "root"]) == 0
+    out, err = capsys.readouterr()
+    s, = kitti.open_sequences("root")
+    assert s.name == "2011_09_26_drive_0013" and complaint(err) == []
+    assert "root: 1 sequences, 12 scans" in out and "split" not in out
+    assert re.search(r"scans 0 to 11, 13\.\d m", out)   # 1.1 s at 12 m/s
+    assert_allclose(s.Tr, Tr, atol=1e-9)
+    assert_allclose(s.poses_cam, truth, atol=1e-3)      # 1 mm
+    assert metrics.step_errors(truth, s.poses_cam).max() < 1e-3
+    assert_allclose(np.loadtxt(s.folder / "times.txt"), 0.1 * np.arange(12), atol=0.01)
+    for scan, path in zip(sorted((here / DRIVE).rglob("*.bin")), s.scan_paths, strict=True):
+        assert path.samefile(scan)                      # takes no room
+    before = files_of(here)
+    fails_with_one_line(kitti.main, ["raw", DRIVE, "root"], "drive_0013 is there already", capsys)
+    assert files_of(here) == before
+
+
+def test_scans_of_a_raw_drive_are_copied_where_they_cannot_be_linked(here, monkeypatch):
+    write_raw(here)
+    before = files_of(DRIVE)
+    def refuse(source, target):
+        raise OSError("Invalid cross-device link")
+    monkeypatch.setattr(os, "link", refuse)
+    assert kitti.convert_raw(DRIVE, "root") == {"2011_09_26_drive_0013": (0, 11)}
+    s, = kitti.open_sequences("root")
+    for i, path in enumerate(s.scan_paths):
+        assert path.read_bytes() == before[f"velodyne_points/data/{i:010d}.bin"]
+    assert files_of(DRIVE) == before
+
+
+def delete(pattern, numbers=(0,)):
+    return lambda drive: [(drive / pattern.format(i)).unlink() for i in numbers]
+
+
+def blank_lines(name, numbers):
+    def spoil(drive):
+        lines = (drive / name).read_text().splitlines()
+        kept = ["" if i in numbers else line for i, line in enumerate(lines)]
+        (drive / name).write_text("\n".join(kept))
+    return spoil
+
+
+@table("spoil, parts", {       # what is missing; the first and the last scan of each sequence
+    "scans": (delete("velodyne_points/data/{:010d}.bin", (3, 4)), [(0, 2), (5, 11)]),
+    "a time": (blank_lines("velodyne_points/timestamps.txt", [7]), [(0, 6), (8, 11)]),
+    "packets": (delete("oxts/data/{:010d}.txt", (4, 5, 6)), [(0, 4), (7, 11)]),
+    "times of packets": (blank_lines("oxts/timestamps.txt", (4, 5, 6)), [(0, 4), (7, 11)]),
+})
+def test_a_raw_drive_is_split_where_something_is_missing(here, capsys, spoil, parts):
+    truth, _ = write_raw(here)
+    spoil(here / DRIVE)
+    assert kitti.main(["raw", DRIVE, "root"]) == 0
+    out, sequences = capsys.readouterr().out, kitti.open_sequences("root")
+    assert "split" in out
+    assert [s.name for s in sequences] == ["2011_09_26_drive_0013-1", "2011_09_26_drive_0013-2"]
+    for s, (first, last) in zip(sequences, parts, strict=True):
+        assert f"{s.name}: scans {first} to {last}" in out
+        assert_allclose(s.poses_cam, np.linalg.inv(truth[first]) @ truth[first:last + 1], atol=1e-3)
+        assert s.scan_paths[-1].samefile(f"{DRIVE}/velodyne_points/data/{last:010d}.bin")
+
+
+SYNC, CALIBRATION = "2011_09_26_drive_0013_sync.zip", "2011_09_26_calib.zip"
+PACKET = "oxts/data/0000000005.txt"
+
+
+@table("spoil, words", {       # what is done to a good drive; what the message must name
+    "no drive": (shutil.rmtree, ("velodyne_points/timestamps.txt", SYNC)),
+    "no scans": (lambda drive: shutil.rmtree(drive / "velodyne_points" / "data"),
+                 ("velodyne_points/data/0000000000.bin", SYNC)),
+    "no packets": (lambda drive: shutil.rmtree(drive / "oxts" / "data"),
+                   ("oxts/data/0000000000.txt", SYNC)),
+    "no times of scans": (delete("velodyne_points/timestamps.txt"),
+                          ("velodyne_points/timestamps.txt", SYNC)),
+    "no times of packets": (delete("oxts/timestamps.txt"), ("oxts/timestamps.txt", SYNC)),
+    "no imu_to_velo": (delete("../calib_imu_to_velo.txt"), ("calib_imu_to_velo.txt", CALIBRATION)),
+    "no velo_to_cam": (delete("../calib_velo_to_cam.txt"), ("calib_velo_to_cam.txt", CALIBRATION)),
+    "no cam_to_cam": (delete("../calib_cam_to_cam.txt"), ("calib_cam_to_cam.txt", CALIBRATION)),
+    "too few times": (write_as("oxts/timestamps.txt", "2011-09-26 13:10:51.1\n"),
+                      ("oxts/timestamps.txt is damaged", SYNC)),
+    "words for times": (write_as("oxts/timestamps.txt", "noon\n" * 12), ("oxts/timestamps.txt",)),
+    "blank times": (write_as("velodyne_points/timestamps.txt", "\n" * 12),
+                    ("velodyne_points/timestamps.txt is damaged", SYNC)),
+    "packets of another day": (write_as("oxts/timestamps.txt", "2011-09-28 13:10:51.1\n" * 12),
+                               (DRIVE, "within 0.1 s", SYNC)),
+    "a packet of 29": (rewrite(PACKET, lambda b: b.rpartition(b" ")[0]), (PACKET, "30")),
+    "a packet with NaN": (rewrite(PACKET, lambda b: b"nan" + b[b.index(b" "):]), (PACKET, "30")),
+    "a scan cut short": (rewrite("velodyne_points/data/0000000007.bin", lambda b: b[:-1]),
+                         ("0000000007.bin",)),
+    "no rotation": (rewrite("../calib_velo_to_cam.txt", lambda b: b.replace(b"R:", b"S:")),
+                    ("calib_velo_to_cam.txt is damaged", CALIBRATION)),
+    "no translation": (rewrite("../calib_imu_to_velo.txt", lambda b: b.replace(b"T:", b"U:")),
+                       ("calib_imu_to_velo.txt is damaged", CALIBRATION)),
+})
+def test_a_raw_drive_that_is_incomplete_or_damaged_is_named_in_one_line(here, capsys, spoil, words):
+    write_raw(here)
+    spoil(here / DRIVE)
+    code, err = kitti.main(["raw", DRIVE, "root"]), capsys.readouterr().err
+    assert code == 2 and len(complaint(err)) == 1 and "Traceback" not in err, err
+    assert all(word in err for word in words), err
+    assert not (here / "root").exists()                 # nothing is left
+
+
+def test_a_folder_that_is_no_raw_drive_is_named_in_one_line(here, capsys):
+    for name in ("gone", ".", "2011_09_26_drive_0013_extract"):
+        words = f"{name} is no drive of KITTI's raw data"
+        fails_with_one_line(kitti.main, ["raw", name, "root"], words, capsys)
+    assert not any(here.iterdir())
+
+
 def test_as_a_user_sees_it_in_a_read_only_place_of_foreign_letters_with_no_home_and_spawned_workers(tmp_path, weights):
     here = tmp_path / "o\u00f9 \u00e7a \u6f22"
 
@@ -1344,9 +1710,21 @@ def test_pictures_are_drawn_where_there_is_matplotlib(here, monkeypatch, capsys)
         patch.setitem(sys.modules, "matplotlib.figure", None)                       # as if it were not installed
         fails_with_one_line(metrics.main, arguments, "matplotlib", capsys)
     pytest.importorskip("matplotlib")
+    drawn, picture = [], metrics.picture
+
+    def remember(*size):
+        drawn.append(picture(*size))
+        return drawn[-1]
+    monkeypatch.setattr(metrics, "picture", remember)
     assert metrics.main(arguments) == 0
     metrics.draw("b.png", {"11": (None, T)})                                        # without ground truth
     assert all(Path(name).read_bytes().startswith(b"\x89PNG") for name in ("a.png", "b.png"))
+    assert [len(figure.axes) for figure in drawn] == [3, 1]    # no errors, one axis
+    for figure in drawn:                                # the poses are a LiDAR's: x forward, y left
+        above = figure.axes[0]
+        assert_allclose(above.lines[-2].get_xydata(), np.c_[-T[:, 1, 3], T[:, 0, 3]], atol=1e-6)
+        assert above.get_ylabel() == "LiDAR x, forward [m]"
+        assert all(axis.get_xlabel() and axis.get_ylabel() for axis in figure.axes)
 
 
 # --------------------------------------------------------------------- the paper's experiments

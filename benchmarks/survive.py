@@ -1,14 +1,19 @@
-"""Kill a training again and again, resume it, and compare with one that was left alone: the weights must be the same, bit by bit.
+"""Interrupt a training run again and again, resume it, and compare the weights bit by bit with
+those of an uninterrupted run.
 
-    python benchmarks/survive.py                    # 50 interruptions, some 15 minutes of one core, all in a temporary folder
+    python benchmarks/survive.py  # 50 interruptions, some 15 minutes of one core
     python benchmarks/survive.py --kills 5
 
-An interruption is kill -9, SIGTERM, Ctrl-C or a write that fails as on a full disk, at a random moment: among them the start, the building
-of the cache, which is deleted now and then, and the writing of a checkpoint, which here happens every half second. After each one, what
-is in the run's folder must be whole. At the end two trainings start at once with no cache, and `eval` runs while they write.
+An interruption is kill -9, SIGTERM, Ctrl-C or a write that fails as on a full disk. It comes at a
+random moment: during start-up, while the cache is built (it is deleted now and then), or while a
+checkpoint is written, which happens every half second here. After each interruption every file of
+the run must be readable. At the end two training runs start at once without a cache, and `eval`
+runs while they write.
+
+Everything happens in a temporary folder. It is kept when a check fails.
 """
 import argparse
-import json
+import collections
 import os
 import random
 import shutil
@@ -27,133 +32,165 @@ import d3dlo
 import kitti
 
 TRAIN = ["train", "--data", "drives", "--short", "--batch", "4", "--epochs", "20"]
+LIMIT = 100_000  # bytes; smaller than weights and cache, so writing these fails
+# The command line with frequent checkpoints. First argument: no file may grow beyond so many bytes,
+# or 0. Ctrl-C works again, which a shell's background job ignores.
 CHILD = f"""
 import resource, signal, sys
-signal.signal(signal.SIGINT, signal.default_int_handler)       # a shell's background job would ignore Ctrl-C
+signal.signal(signal.SIGINT, signal.default_int_handler)
 sys.path.insert(0, {str(HERE)!r})
 import d3dlo, torch
 if __name__ == "__main__":
     torch.set_num_threads(1)
     d3dlo.STORE_EVERY = 0.5
-    if int(sys.argv[1]):
-        resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), int(sys.argv[1])))
+    limit = int(sys.argv[1])
+    if limit:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
     sys.exit(d3dlo.main(sys.argv[2:]))
 """
 
 
-def start(arguments, largest_file=0):
-    """A process of the command line, in a group of its own as in a terminal; no file of it grows beyond `largest_file` bytes."""
-    return subprocess.Popen([sys.executable, "-c", CHILD, str(largest_file), *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-                            text=True, start_new_session=True)
+def start(arguments, limit=0):
+    """Start the command line in a process group of its own, as a terminal does."""
+    command = [sys.executable, "-c", CHILD, str(limit), *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+                            start_new_session=True)
+
+
+def start_training(run):
+    """The arguments that begin the training run or, once it has begun, resume it."""
+    begun = (run / "config.json").exists()
+    return ["train", "--out", str(run), "--resume"] if begun else [*TRAIN, "--out", str(run)]
 
 
 def finish(process, *codes):
-    """Wait for a process and insist on its exit code and, unless it is 0, on one line of complaint."""
+    """Wait for a process. Its exit code must be one of `codes`, and there must be no traceback."""
     output = process.communicate()[0]
-    if process.returncode not in codes or "Traceback" in output and process.returncode >= 0:      # below 0: while Python imported
-        sys.exit(f"survive: exit code {process.returncode}, {codes} expected:\n{output[-2000:]}")
-    return output
+    code = process.returncode
+    killed = code < 0  # maybe while Python was importing, which prints a traceback
+    if code not in codes or "Traceback" in output and not killed:
+        fail(f"exit code {code}, expected one of {codes}:\n{output[-2000:]}")
+
+
+def fail(what):
+    """Stop, and say where the files are."""
+    sys.exit(f"survive: {what}\nfiles: {Path.cwd()}")
 
 
 def interrupt(run, rng):
-    """Begin or resume the training, stop it somewhere -> how, or "finished"."""
-    how = rng.choice(["kill -9", "kill -9", "SIGTERM", "Ctrl-C", "no more room"])
-    resume = ["train", "--out", str(run), "--resume"] if (run / "config.json").exists() else [*TRAIN, "--out", str(run)]
-    process = start(resume, 100_000 if how == "no more room" else 0)
-    if how == "no more room":
-        finish(process, 2)
+    """Begin or resume the training run and interrupt it. Returns how, or "finished"."""
+    how = rng.choice(["kill -9", "kill -9", "SIGTERM", "Ctrl-C", "failed write"])
+    if how == "failed write":
+        finish(start(start_training(run), LIMIT), 2)
         return how
+    process = start(start_training(run))
     try:
         process.wait(rng.uniform(0, 12))
         finish(process, 0)
         return "finished"
     except subprocess.TimeoutExpired:
         pass
-    if how == "Ctrl-C":
-        os.killpg(process.pid, signal.SIGINT)           # a terminal sends it to all
-    else:
-        process.send_signal(signal.SIGKILL if how == "kill -9" else signal.SIGTERM)
     if how == "kill -9":
+        process.kill()
         process.communicate()
+        return how
+    if how == "Ctrl-C":
+        os.killpg(process.pid, signal.SIGINT)  # a terminal sends it to the whole group
     else:
-        finish(process, 0, 130, -signal.SIGINT, -signal.SIGTERM)        # before Python listens, the signal itself ends it
+        process.terminate()
+    # 0: it was about to end; a signal: Python had not installed its handlers yet
+    finish(process, 0, 130, -signal.SIGINT, -signal.SIGTERM)
     return how
 
 
-def whole(run):
-    """Everything in a run's folder can be read."""
-    for path in run.glob("*.pt"):
-        d3dlo.load_weights(path, checkpoint=path.name == "checkpoint.pt")
-    if (run / "config.json").exists():
-        d3dlo.begun_with(run)
+def check_readable(run):
+    """Every file of a training run is missing or complete."""
+    try:
+        for path in run.glob("*.pt"):
+            d3dlo.load_weights(path, checkpoint=path.name == "checkpoint.pt")
+        if (run / "config.json").exists():
+            d3dlo.read_run(run)
+    except ValueError as error:
+        fail(error)
 
 
-def leftovers(folder):
-    """Temporary files."""
-    return [path for path in folder.rglob(".*") if path.is_file()]
+def temporary_files():
+    """Number of temporary files left."""
+    return sum(path.is_file() for path in Path().rglob(".*"))
 
 
-def same(a, b):
-    """The same steps, tensors and random state in two files of weights or checkpoints."""
-    x, y = (torch.load(path, weights_only=True) for path in (a, b))
+def equal(a, b):
+    """Whether two contents of weights files are the same, bit by bit."""
+    if isinstance(a, torch.Tensor):
+        return torch.equal(a, b)
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(equal(a[key], b[key]) for key in a)
+    if isinstance(a, (list, tuple)):
+        return len(a) == len(b) and all(map(equal, a, b))
+    return a == b
 
-    def equal(u, v):
-        if isinstance(u, torch.Tensor):
-            return torch.equal(u, v)
-        if isinstance(u, dict):
-            return u.keys() == v.keys() and all(equal(u[key], v[key]) for key in u)
-        if isinstance(u, (list, tuple)):
-            return len(u) == len(v) and all(map(equal, u, v))
-        return u == v
-    return equal(x, y)
+
+def check_same(run, name="checkpoint.pt"):
+    """A file of a training run is that of the uninterrupted run."""
+    a, b = (torch.load(folder / name, weights_only=True) for folder in (run, Path("alone")))
+    if not equal(a, b):
+        fail(f"{run}/{name} differs from that of the uninterrupted run")
+
+
+def interrupted_runs(kills, rng):
+    """Interrupt training runs `kills` times; each must end in the same weights."""
+    run, counts, most = Path("interrupted"), collections.Counter(), 0
+    while counts.total() - counts["finished"] < kills:
+        if rng.random() < 0.2:
+            shutil.rmtree("cache", ignore_errors=True)
+        how = interrupt(run, rng)
+        counts[how] += 1
+        check_readable(run)
+        most = max(most, temporary_files())
+        print(f"{counts.total() - counts['finished']}/{kills}: {how}", flush=True)
+        if how == "finished":  # compare, and begin another run
+            check_same(run)
+            shutil.rmtree(run)
+    finish(start(start_training(run)), 0)
+    check_same(run)
+    check_same(run, "weights.pt")
+    print("the same weights and optimiser state after "
+          + ", ".join(f"{n} {how}" for how, n in counts.items())
+          + f"; at most {most} temporary files, now {temporary_files()}", flush=True)
+
+
+def two_runs_at_once():
+    """Two training runs build the same cache while `eval` reads the weights of one of them."""
+    shutil.rmtree("cache")
+    runs, evaluated = [Path("two", str(i)) for i in range(2)], 0
+    processes = [start(start_training(run)) for run in runs]
+    while any(process.poll() is None for process in processes):
+        evaluation = start(["eval", "--data", "drives", "--weights", str(runs[0]),
+                            "--out", "evaluated"])
+        finish(evaluation, 0, 2)  # 2: there are no weights yet
+        evaluated += evaluation.returncode == 0
+    for process, run in zip(processes, runs):
+        finish(process, 0)
+        check_same(run)
+    print(f"two at once: the same weights, {evaluated} evaluations meanwhile; "
+          f"{temporary_files()} temporary files")
 
 
 def main():
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kills", type=int, default=50, metavar="N")
-    parser.add_argument("--seed", type=int, default=0, metavar="N")
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=50, metavar="N", help=(
+        "number of interruptions (default: 50)"))
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="default: 0")
     args = parser.parse_args()
-    rng, counts, most = random.Random(args.seed), {}, 0
     os.chdir(tempfile.mkdtemp(prefix="d3dlo-survive-"))
     kitti.simulate("drives", sequences=("00", "03"), scans=30, azimuth=200)
     began = time.monotonic()
-    finish(start([*TRAIN, "--out", "alone"]), 0)
-    print(f"left alone: {time.monotonic() - began:.0f} s", flush=True)
-    run, kills = Path("killed"), 0
-    while kills < args.kills:
-        if rng.random() < 0.2:
-            shutil.rmtree("cache", ignore_errors=True)  # so that it is built again
-        how = interrupt(run, rng)
-        whole(run)
-        if how == "finished":                           # begin another one; the last must end as the first
-            if not same(run / "checkpoint.pt", "alone/checkpoint.pt"):
-                sys.exit("survive: a resumed training ended in other weights")
-            shutil.rmtree(run)
-        kills += how != "finished"
-        counts[how] = counts.get(how, 0) + 1
-        most = max(most, len(leftovers(Path())))
-        print(f"{kills}/{args.kills}: {how}", flush=True)
-    if not (run / "config.json").exists():
-        finish(start([*TRAIN, "--out", str(run)]), 0)
-    else:
-        finish(start(["train", "--out", str(run), "--resume"]), 0)
-    for name in ("checkpoint.pt", "weights.pt"):
-        if not same(run / name, f"alone/{name}"):
-            sys.exit(f"survive: {name} is not that of the training left alone")
-    print(f"the same weights, optimiser and schedule, bit by bit, after {json.dumps(counts)}; at most {most} temporary files, now {len(leftovers(Path()))}")
-
-    shutil.rmtree("cache")
-    two, evaluated = [start([*TRAIN, "--out", f"two/{i}"]) for i in range(2)], 0
-    while any(process.poll() is None for process in two):
-        evaluation = start(["eval", "--data", "drives", "--weights", "two/0", "--out", "evaluated"])
-        finish(evaluation, 0, 2)                        # 2: there are no weights yet
-        evaluated += evaluation.returncode == 0
-    for i, process in enumerate(two):
-        finish(process, 0)
-        if not same(f"two/{i}/checkpoint.pt", "alone/checkpoint.pt"):
-            sys.exit("survive: two at once ended in other weights")
-    print(f"two at once: the same weights, and {evaluated} evaluations while they wrote; {len(leftovers(Path()))} temporary files")
+    finish(start(start_training(Path("alone"))), 0)
+    print(f"uninterrupted: {time.monotonic() - began:.0f} s", flush=True)
+    interrupted_runs(args.kills, random.Random(args.seed))
+    two_runs_at_once()
     shutil.rmtree(Path.cwd())
 
 
