@@ -32,6 +32,9 @@ SMALL = Config(sa1=Layer(2.0, 32, 4, (4, 8, 16)), fe=Layer(None, None, 6, (16, 3
                sa3=Layer(8.0, 8, 4, (32, 32)), mpn=Layer(None, None, None, (32, 64)), mlp=Layer(None, None, None, (32, 6)),
                max_range=50.0, swap="both")
 generator = np.random.default_rng
+# What a weights file says about its training data; any scan looks like them.
+FACTS = dict(train={}, before=[], mean_motion=[1.0, 0, 0, 0, 0, 0],
+             seen=[[1.0, 0.1, 1.0, 0.01], [1e6, 1.0, 100.0, 1.0]])
 
 
 def table(arguments, cases):
@@ -411,7 +414,7 @@ def test_sixteen_pairs_can_be_learned_by_heart(tmp_path, frozen):
     geometry, motions = pairs_of_scans(generator(0), 16)
     config, said = replace(SMALL, epochs=300, lr=1e-2, schedule="one-cycle", frozen=frozen), []
     torch.manual_seed(0)
-    net = d3dlo.fit(D3DLO(config), geometry, motions, tmp_path, 0, "cpu", say=said.append)
+    net = d3dlo.fit(D3DLO(config), geometry, motions, tmp_path, say=said.append, **FACTS)
     before, in_training, in_use = (float(re.search(r"[\d.]{6}", line)[0]) for line in (said[0], said[-2], said[-1]))
     assert before > 0.3 and in_training < 0.02 and in_use < 0.02                    # eq. 2, m and degrees alike
     got = to_vector(np.concatenate([d3dlo.predict_motions(net, records) for records in geometry]))
@@ -504,7 +507,8 @@ def fit(folder, config, resume=None, test=None, say=None):
     said = []
     torch.manual_seed(0 if resume is None else 99)  # a resumed net must not depend on its start
     with contextlib.suppress(KeyboardInterrupt, BrokenPipeError):
-        d3dlo.fit(D3DLO(config), *drives(), folder, 7, "cpu", resume, say or said.append, test=test)
+        d3dlo.fit(D3DLO(config), *drives(), folder, 7, "cpu", resume, say or said.append,
+                  test=test, **FACTS)
     return said
 
 
@@ -672,8 +676,7 @@ def test_the_test_loss_changes_nothing_and_is_logged_once_an_epoch(tmp_path, con
     assert [len(TEST_LOSS.findall(line)) for line in whole] == [1] * 4 + [0]
 
     # The last one is that of the weights in the file, over both directions of all pairs.
-    net, errors = D3DLO(config).eval(), []
-    net.load_state_dict(stored(tmp_path / "whole")["model"])
+    net, errors = load_weights(tmp_path / "whole")[0], []
     for records, T in zip(*test):
         for pair, motions in ((records, T), (records[::-1], invert(T))):
             errors.append(to_vector(d3dlo.predict_motions(net, pair)) - to_vector(motions))
@@ -1106,10 +1109,10 @@ def test_temporaries_of_dead_processes_go_and_those_of_living_ones_stay(tmp_path
 
 # --------------------------------------------------------------------------------------------------- weights and odometry
 
-def save_weights(path, config=Config(), seen=([1.0, 0.1, 1.0, 0.01], [1e6, 1.0, 100.0, 1.0])):
+def save_weights(path, config=Config(), **facts):
     """A file as `fit` writes it, of a network that was never trained."""
-    net, remember = a_net(generator(0), config), dict(train={}, before=[], mean_motion=[1.0, 0, 0, 0, 0, 0], seen=seen)
-    d3dlo.save(path, config=config.as_dict(), model=net.state_dict(), step=0, **remember)
+    net = a_net(generator(0), config)
+    d3dlo.save(path, config=config.as_dict(), model=net.state_dict(), step=0, **FACTS | facts)
     return net
 
 
