@@ -1,6 +1,6 @@
 """Properties of D3DLO. Every expectation comes from an independent source: brute force, SciPy, a definition written out, or a closed
 form. Real data are optional: D3DLO_KITTI names a folder in KITTI odometry layout; without it those tests are skipped."""
-import argparse, contextlib, copy, json, math, os, pickle, re, runpy, shutil, signal, subprocess, sys, warnings, zipfile
+import argparse, contextlib, copy, errno, json, math, os, pickle, re, runpy, shutil, signal, subprocess, sys, time, warnings, zipfile
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -1107,6 +1107,109 @@ def test_temporaries_of_dead_processes_go_and_those_of_living_ones_stay(tmp_path
     assert sorted(tmp_path.iterdir()) == sorted([left["1"], left["no-pid"], other])
 
 
+def test_a_scan_changed_with_its_size_and_time_kept_is_computed_again(tmp_path):
+    sequences = kitti.open_sequences(write_root(tmp_path / "root", size=60))
+
+    def load():
+        (records,), (fingerprint,) = load_geometry(sequences, SMALL, tmp_path / "cache")
+        return [record.tobytes() for record in records], fingerprint
+    (old, before), path = load(), sequences[0].scan_paths[3]
+    change_in_the_middle(path)
+    new, after = load()
+    assert before != after
+    assert [i for i in range(6) if old[i] != new[i]] == [3]
+    assert new[3] == scan_geometry(sequences[0].scan(3), SMALL).tobytes()
+
+
+def change_in_the_middle(path):
+    """Of a scan file, and keep its size and modification time, as `rsync -t` does."""
+    data, stat = bytearray(path.read_bytes()), path.stat()
+    data[len(data) // 32 * 16 + 3] ^= 128  # the sign of an x
+    path.write_bytes(data)
+    os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    assert path.stat().st_mtime_ns == stat.st_mtime_ns
+
+
+def test_only_regular_files_are_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "folder").mkdir()
+    for name in ("pipe", "folder"):
+        with pytest.raises(OSError, match=f"{name}.*not a regular file"):
+            metrics.write_poses(tmp_path / name, straight(2))
+    assert (tmp_path / "pipe").is_fifo() and sorted(os.listdir(tmp_path)) == ["folder", "pipe"]
+
+
+def test_a_full_disk_is_named_with_the_file(tmp_path):
+    with pytest.raises(OSError, match=f"No space.*{tmp_path / 'a.txt'}"):
+        with metrics.replacing(tmp_path / "a.txt"):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert not any(tmp_path.iterdir())
+
+
+def test_default_names_of_the_same_second_differ(tmp_path, monkeypatch):
+    monkeypatch.setattr(time, "strftime", lambda form: "now")
+    names = []
+    for _ in range(3):
+        names.append(kitti.new_name(tmp_path / "runs"))
+        names[-1].mkdir(parents=True)
+    assert len(set(names)) == 3 and {path.parent for path in names} == {tmp_path / "runs"}
+
+
+def test_a_pose_file_may_begin_with_a_byte_order_mark_and_utf_16_is_named(tmp_path):
+    path, T = tmp_path / "a.txt", straight(3)
+    metrics.write_poses(path, T)
+    text = path.read_text()
+    path.write_text(text, encoding="utf-8-sig")  # with a byte order mark
+    assert_allclose(metrics.read_poses(path), T)
+    path.write_text(text, encoding="utf-16")
+    with pytest.raises(ValueError, match="a.txt.*UTF-16"):
+        metrics.read_poses(path)
+
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+import kitti
+with kitti.run_folder(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_run_folder_has_one_writer_and_a_killed_one_leaves_it_free(tmp_path):
+    command = [sys.executable, "-c", HOLDER, tmp_path / "run"]
+    other = subprocess.Popen(command, stdout=subprocess.PIPE, cwd=HERE, text=True)
+    try:
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(ValueError, match=rf"run: .*process {other.pid} on ."):
+            with kitti.run_folder(tmp_path / "run"):
+                pass
+    finally:
+        other.kill()
+        other.communicate()
+    with kitti.run_folder(tmp_path / "run"):  # it is free, and says who has it now
+        assert (tmp_path / "run" / "lock").read_text().startswith(f"process {os.getpid()} on ")
+
+
+UNGUARDED = """
+import multiprocessing, kitti
+multiprocessing.set_start_method("spawn", force=True)
+try:
+    print([*kitti.in_processes(abs, [1, 2], workers=1)])
+except OSError as error:
+    print(error)
+"""
+
+
+def test_a_script_without_a_guard_is_told_what_is_missing(tmp_path):
+    (tmp_path / "script.py").write_text(UNGUARDED)
+    environment = os.environ | {"PYTHONPATH": str(HERE)}
+    ran = subprocess.run([sys.executable, tmp_path / "script.py"], env=environment, timeout=60,
+                         capture_output=True, text=True)
+    line, = ran.stdout.splitlines()
+    assert "if __name__ == '__main__':" in line and ran.returncode == 0
+
+
 # --------------------------------------------------------------------------------------------------- weights and odometry
 
 def save_weights(path, config=Config(), **facts):
@@ -1193,6 +1296,37 @@ def test_refining_answers_both_ways_and_again_for_what_is_left(seed):
         for _ in range(2):
             expected = half_way(p, d3dlo.move_scans(q[None], expected[None])[0]) @ expected     # see the test of augment
         assert_allclose(T, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("refine", [-1, 1.5, "1", None, float("nan")])
+def test_a_number_of_refinements_that_makes_no_sense_is_refused(weights, refine):
+    scan = np.ones((2000, 4), np.float32)
+    for call in (lambda: d3dlo.Odometry(weights, refine=refine),
+                 lambda: d3dlo.relative_pose(scan, scan, weights, refine),
+                 lambda: d3dlo.evaluate(weights=weights, refine=refine)):
+        with pytest.raises(ValueError, match="refine"):
+            call()
+
+
+NAN = float("nan")
+
+
+@table("settings, named", {str(settings): (settings, named) for settings, named in [
+    (dict(epochs=1.5), "epochs"), (dict(epochs=0), "epochs"), (dict(batch=NAN), "batch"),
+    (dict(sa1=Config.sa1._replace(r=-1.0)), "radius"), (dict(sa2=Config.sa2._replace(r=NAN)), "radius"),
+    (dict(sa3=Config.sa3._replace(r=0)), "radius"), (dict(max_range=-50.0), "max_range"),
+    (dict(max_range=NAN), "max_range"), (dict(max_range=0), "max_range"), (dict(lr=NAN), "lr"),
+    (dict(lr=-1e-3), "lr"), (dict(lr=float("inf")), "lr"), (dict(frozen=1.0), "frozen"),
+    (dict(frozen=-0.1), "frozen"), (dict(frozen=NAN), "frozen"),
+    (dict(sa1=Config.sa1._replace(n_n=99999999)), "n_n"), (dict(fe=Config.fe._replace(n_n=0)), "n_n"),
+    (dict(sa1=Config.sa1._replace(n_fps=65536)), "n_fps"),
+    (dict(sa3=Config.sa3._replace(n_fps=257)), "n_fps"), (dict(plane="no"), "plane"),
+    (dict(augment=2), "augment"), (dict(optimizer="sgd"), "optimizer"),
+    (dict(schedule="cosine"), "schedule"), (dict(swap="always"), "swap"),
+    (dict(mlp=Layer(None, None, None, (64, 7))), "mlp"), (dict(mpn=Layer(None, None, None, ())), "MLP")]})
+def test_a_config_that_makes_no_sense_is_refused_by_name(settings, named):
+    with pytest.raises(ValueError, match=rf"Config: .*{named}"):
+        Config(**settings)
 
 
 @pytest.mark.filterwarnings("ignore")
