@@ -1309,6 +1309,7 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     check_device(device)
     check_number("seed", seed)
     run = kitti.new_name("runs") if out is None else Path(out)
+    check_output(run, data or SIMULATED)
     with kitti.run_folder(run):
         config = config or Config(**({} if data else SHORT))
         if resume:
@@ -1319,7 +1320,6 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
         data, weights = (path and str(Path(path).resolve()) for path in (data, weights))
         net, checkpoint, before = starting_point(run, resume, weights, config, network, seed)
         root = data_root(data, sequences, whole=True)
-        check_output(run, root)
         chosen, held_out = choose_sequences(root, sequences)
         n, names, motions = len(chosen), [s.name for s in chosen], [s.motions() for s in chosen]
         # Held-out scans too, so that a broken one is found now and not after the training
