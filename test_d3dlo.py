@@ -1,6 +1,6 @@
 """Properties of D3DLO. Every expectation comes from an independent source: brute force, SciPy, a definition written out, or a closed
 form. Real data are optional: D3DLO_KITTI names a folder in KITTI odometry layout; without it those tests are skipped."""
-import argparse, contextlib, copy, errno, json, math, os, pickle, re, runpy, shutil, signal, subprocess, sys, time, warnings, zipfile
+import argparse, contextlib, copy, errno, io, json, math, os, pickle, re, runpy, shutil, signal, subprocess, sys, time, warnings, zipfile
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -1493,6 +1493,7 @@ def test_train_then_eval_then_train_again(here, city, capsys):
     results, out = json.loads((here / "out" / "results.json").read_text()), capsys.readouterr().out
     assert results["sequences"]["07"] == trained["sequences"]["07"]                 # it was held out, and evaluated at the end
     assert [s["trained_on"] for s in results["sequences"].values()] == [True, False] and re.search(r"^00 \*", out, re.M)
+    assert results["pooled"]["trained_on"] and re.search(r"^all \*", out, re.M)  # one was
     fails_with_one_line(d3dlo.main, arguments, "--resume", capsys)                  # never over an earlier training
     shutil.copy("data/poses/07.txt", "data/poses/00.txt")
     fails_with_one_line(d3dlo.main, ["train", "--out", "run", "--resume"], "the data have changed", capsys)
@@ -1553,6 +1554,151 @@ def test_a_recipe_does_not_change_the_network_and_input_of_given_weights(here, s
     assert config_of("run") == expected.as_dict()
 
 
+@table("out", {"the root": "root", "poses": "root/poses", "below poses": "root/poses/new",
+               "a sequence": "root/sequences/00", "a link": "link", "dots": "root/poses/../poses"})
+def test_results_are_never_written_among_the_data(here, capsys, out):
+    write_root(here / "root", size=60)
+    (here / "link").symlink_to("root/poses")
+    save_weights("w.pt", SMALL)
+    before, folders = files_of(here), sorted(here.rglob("*"))
+    for command in ("eval --weights w.pt", "train --epochs 1"):
+        arguments = [*command.split(), "--data", "root", "--out", out]
+        fails_with_one_line(d3dlo.main, arguments, "--out", capsys)
+    assert files_of(here) == before and sorted(here.rglob("*")) == folders
+
+
+def test_eval_used_again_removes_what_the_earlier_evaluation_listed_and_nothing_else(here):
+    write_root(here / "root", ("03", "07"), size=60)
+    save_weights("w.pt", SMALL)
+    (here / "root" / "notes.txt").write_text("mine")
+
+    def evaluate(*sequences):
+        d3dlo.evaluate("root", "w.pt", sequences, "out")
+        return set(os.listdir("out"))
+    assert evaluate("03", "07") == {"03.txt", "07.txt", "results.json"}
+    for name in ("notes.txt", "00.txt"):
+        (here / "out" / name).write_text("mine")
+    assert evaluate("07") == {"07.txt", "results.json", "notes.txt", "00.txt"}
+    content = json.loads((here / "out" / "results.json").read_text())
+    content["files"] += ["../root/notes.txt", str(here / "w.pt"), "gone.txt"]  # not of this folder
+    (here / "out" / "results.json").write_text(json.dumps(content))
+    assert evaluate("03") == {"03.txt", "results.json", "notes.txt", "00.txt"}
+    assert (here / "root" / "notes.txt").read_text() == "mine" and (here / "w.pt").exists()
+
+
+def test_eval_refines_as_often_as_asked(here):
+    s, = kitti.open_sequences(write_root(here / "root", size=60))
+    net = save_weights("w.pt", SMALL)
+    records = np.stack([scan_geometry(s.scan(i), SMALL) for i in range(6)])
+    assert d3dlo.main("eval --data root --weights w.pt --refine 2 --out out".split()) == 0
+    got = kitti.camera_to_velo(metrics.read_poses("out/00.txt"), s.Tr)
+    plain, _, twice = (d3dlo.accumulate(d3dlo.predict_motions(net, records, refine=n)) for n in range(3))
+    assert_allclose(got, twice, atol=1e-3)
+    assert np.abs(got - plain).max() > 0.1
+
+
+def test_the_baselines_stand_still_or_repeat_the_mean_motion_of_training(here, capsys):
+    mean = [10.0, 1, 0, 0, 0, 3]
+    s, = kitti.open_sequences(write_root(here / "root", ("03",), scans=15, size=60, step=14))
+    save_weights("w.pt", SMALL, mean_motion=mean)
+    assert d3dlo.main("eval --data root --weights w.pt --out out".split()) == 0
+    out, results = capsys.readouterr().out, json.loads((here / "out" / "results.json").read_text())
+    for name, motion in {"standing still": np.eye(4), "mean motion of training": by_hand(mean)}.items():
+        T = [np.linalg.matrix_power(motion, i) for i in range(15)]
+        errors = np.linalg.inv(motion) @ s.motions()
+        steps = [np.linalg.norm(errors[:, :3, 3], axis=1),
+                 np.degrees(Rotation.from_matrix(errors[:, :3, :3]).magnitude())]
+        segments = devkit(s.poses_cam, s.Tr @ T @ np.linalg.inv(s.Tr))[:, 3:]
+        expected = [*segments.mean(0), *np.mean(steps, 1)]
+        for group in (results["pooled"], results["splits"]["test"]):
+            got = [group[name][key] for key in ("E_t", "E_r", "t_step_m", "r_step_deg")]
+            assert_allclose(got, expected, rtol=1e-6)
+        assert figures(out, f"  {name}") == as_printed(results["pooled"][name])
+
+
+def test_neighbors_and_no_plane_are_settings_of_the_network_trained(here):
+    write_root(here / "root", scans=3, size=1500)
+    arguments = "train --data root --neighbors 5 --no-plane --epochs 1 --out run"
+    assert d3dlo.main(arguments.split()) == 0
+    expected = Config(epochs=1, plane=False, sa1=Layer(1.0, 1024, 5, (4, 8, 16, 32)))
+    assert load_weights("run")[0].config == expected
+
+
+def test_the_seed_sets_the_first_weights_and_the_mean_motion_is_stored(here):
+    s, = kitti.open_sequences(write_root(here / "root", size=60))
+    first = []
+    for run, seed in enumerate((0, 0, 1)):
+        d3dlo.train(replace(SMALL, epochs=1, lr=1e-12), "root", out=f"run{run}", seed=seed)
+        net, state = load_weights(f"run{run}")
+        first.append(net.sa2.mpn.h[0].weight.detach())
+        assert_allclose(state["mean_motion"], to_vector(s.motions()).mean(0), atol=1e-6)
+    assert torch.equal(first[0], first[1]) and (first[0] - first[2]).abs().max() > 0.01
+
+
+def test_a_run_folder_in_use_is_refused_in_one_line_that_names_the_process(here):
+    write_root(here / "root", scans=2)
+    with kitti.run_folder(here / "run"):
+        ran = subprocess.run([sys.executable, HERE / "d3dlo.py", *"train --data root --out run".split()],
+                             capture_output=True, text=True, timeout=60)
+    line, = complaint(ran.stderr)
+    assert ran.returncode == 2 and f"process {os.getpid()} on" in line and "run:" in line
+    assert not (here / "run").exists() and not (here / "cache").exists()
+
+
+def test_a_run_is_not_resumed_with_a_scan_changed_in_its_middle(here, capsys):
+    root = write_root(here / "root", size=60)
+    d3dlo.train(replace(SMALL, epochs=1), "root", out="run")
+    change_in_the_middle(root / SCAN)
+    fails_with_one_line(d3dlo.main, "train --out run --resume".split(), "data have changed", capsys)
+
+
+def test_train_says_in_one_line_that_the_loss_diverged(here, capsys):
+    write_root(here / "root")
+    arguments = "train --data root --epochs 50 --batch 2 --lr 1e30 --out run"
+    fails_with_one_line(d3dlo.main, arguments.split(), "step 1, learning rate 1.0e+30", capsys)
+    assert set(os.listdir("run")) == {"config.json", "lock", "log.txt"}
+
+
+def test_a_training_run_whose_output_nobody_reads_is_resumed_to_the_same_weights(
+        here, monkeypatch, capsys):
+    class Closed(io.StringIO):  # as by `| head -3`
+        def write(self, text):
+            if "epoch 1/" in text:
+                raise BrokenPipeError
+            return super().write(text)
+    write_root(here / "root", scans=4)
+    arguments = "train --data root --epochs 2 --batch 2 --out".split()
+    assert d3dlo.main([*arguments, "whole"]) == 0
+    capsys.readouterr()
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", Closed())
+        assert d3dlo.main([*arguments, "run"]) == 2
+    line, = complaint(capsys.readouterr().err)
+    assert "--resume" in line and stored(here / "run", "checkpoint.pt")["step"] == 1
+    assert d3dlo.main("train --out run --resume".split()) == 0
+    assert_same_model(stored(here / "run"), stored(here / "whole"))
+
+
+def test_an_interruption_while_the_cache_is_made_leaves_no_run_to_resume(here, monkeypatch, capsys):
+    def interrupt(*arguments):
+        raise KeyboardInterrupt
+    write_root(here / "root", scans=2)
+    monkeypatch.setattr(kitti, "in_processes", interrupt)
+    assert d3dlo.main("train --data root --out runs/run".split()) == 130
+    line, = complaint(capsys.readouterr().err)
+    assert "run the same command again" in line and not (here / "runs").exists()
+
+
+def test_a_full_disk_is_said_in_one_line(here, monkeypatch, capsys):
+    def full(*arguments, **options):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    write_root(here / "root", size=60)
+    save_weights("w.pt", SMALL)
+    monkeypatch.setattr(np, "savetxt", full)
+    arguments = "eval --data root --weights w.pt --out out"
+    fails_with_one_line(d3dlo.main, arguments.split(), "No space left on device: 'out/00.txt'", capsys)
+
+
 def test_the_version_is_printed(capsys):
     with pytest.raises(SystemExit) as end:
         d3dlo.main(["--version"])
@@ -1603,6 +1749,10 @@ def test_bad_data_is_named_in_one_line_and_leaves_nothing_behind(here, weights, 
     "eval --data root --device nonsense": "nonsense", "train --resume": "--out", "train --resume --out gone": "gone",
     "train --data root --sequences test": "test", "train --sequences 00 0O": "0O", "train --data root --weights gone.pt": "gone.pt",
     "train --data root --weights gone.pt --no-plane": "--no-plane", "train --data root --lr 0": "lr",
+    "train --data root --lr nan": "lr", "train --data root --neighbors 99999999": "n_n",
+    f"train --data root --seed {10**23}": "seed", "train --data root --seed -1": "seed",
+    "eval --data root --refine -1": "refine", "eval --data root --device meta": "--device meta",
+    "train --data root --device meta": "--device meta",
 }.items())
 def test_bad_arguments_are_named_in_one_line(here, capsys, arguments, words):
     write_root(here / "root")
