@@ -135,7 +135,7 @@ def paths(root, plain, refined, names):
         simulated = (s.folder / "simulated.json").exists()
         files = [folder / f"{s.name}.txt" for folder in (plain, refined)]
         poses = dict(zip(COLOURS, [s.poses_cam, *map(metrics.read_poses, files)]))
-        drives.append(("sim-" * simulated + s.name, poses))
+        drives.append(("simulated " * simulated + s.name, poses))
     figure = metrics.picture(4.2 * len(drives), 4.6)
     axes = np.atleast_1d(figure.subplots(1, len(drives)))
     points = [np.concatenate([T[:, :3, 3] for T in poses.values()]) for _, poses in drives]
