@@ -1584,6 +1584,9 @@ def test_eval_used_again_removes_what_the_earlier_evaluation_listed_and_nothing_
     (here / "out" / "results.json").write_text(json.dumps(content))
     assert evaluate("03") == {"03.txt", "results.json", "notes.txt", "00.txt"}
     assert (here / "root" / "notes.txt").read_text() == "mine" and (here / "w.pt").exists()
+    for content in ("[]", '{"files": null}', '{"files": [1]}', "no JSON"):  # not one of ours
+        (here / "out" / "results.json").write_text(content)
+        assert evaluate("03") == {"03.txt", "results.json", "notes.txt", "00.txt"}
 
 
 def test_eval_refines_as_often_as_asked(here):
