@@ -1803,6 +1803,16 @@ def test_metrics_on_the_command_line(here, capsys):
         fails_with_one_line(metrics.main, bad, bad[1], capsys)
 
 
+def test_a_picture_never_replaces_the_poses_it_is_drawn_from(here, capsys):
+    for name in ("gt/00", "est/00"):
+        metrics.write_poses(f"{name}.txt", straight(5))
+    before = files_of(here)
+    for pair in (["gt/00.txt", "est/00.txt"], ["gt", "est"]):
+        for plot in ("gt/00.txt", "est/../est/00.txt"):
+            fails_with_one_line(metrics.main, [*pair, "--plot", plot], "--plot", capsys)
+    assert files_of(here) == before
+
+
 def test_simulate_on_the_command_line(here, city, capsys):
     arguments = ["simulate", "city", "--sequences", "07", "--scans", "8", "--azimuth", "300"]
     assert kitti.main(arguments) == 0
