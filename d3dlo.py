@@ -1322,39 +1322,46 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
         net, checkpoint, before = starting_point(run, resume, weights, config, network, seed)
         root = data_root(data, sequences, whole=True)
         chosen, held_out = choose_sequences(root, sequences)
-        n, names, motions = len(chosen), [s.name for s in chosen], [s.motions() for s in chosen]
+        names, motions = [s.name for s in chosen], [s.motions() for s in chosen]
+        per_epoch = steps_per_epoch(motions, net.config)
         # Held-out scans too, so that a broken one is found now and not after the training
-        geometry, prints = load_geometry(chosen + held_out, net.config)
-        fingerprints = dict(zip(names, prints))
+        geometry, fingerprints = load_geometry(chosen + held_out, net.config)
+        test = test_data(held_out, geometry[len(chosen):])
+        geometry, fingerprints = geometry[:len(chosen)], dict(zip(names, fingerprints))
         if checkpoint and checkpoint["train"] != fingerprints:
             raise ValueError(f"{run}: the data have changed since this training run started; "
                              "resume it with the data it was started with")
-        tested = [(records, s.motions()) for records, s in zip(geometry[n:], held_out)
-                  if s.name in SPLITS["test"] and s.poses is not None and len(s) > 1]
-        facts = training_facts(fingerprints, motions, geometry[:n], before)
+        facts = training_facts(fingerprints, motions, geometry, before)
         arguments = dict(data=data, sequences=names, seed=seed, device=device, weights=weights)
         write_run(run, arguments, net.config)
 
-        def say(line):
-            with open(run / "log.txt", "a", encoding="utf-8") as log:
-                log.write(line + "\n")
-            print(line, flush=True)
-
+        say = functools.partial(print_and_log, run / "log.txt")
         parameters, pairs = sum(p.numel() for p in net.parameters()), sum(map(len, motions))
         say(f"{parameters:,} parameters, {pairs:,} pairs of scans of {' '.join(names)}, "
-            f"{net.config.epochs} epochs of {steps_per_epoch(motions, net.config)} batches "
-            f"-> {run}")
+            f"{net.config.epochs} epochs of {per_epoch} batches -> {run}")
         if not sequences and (missing := set(SPLITS["train"]) - set(names)):
             say(f"of the training split {' '.join(sorted(missing))} are missing")
-        fit(net, geometry[:n], motions, run, seed, device, checkpoint, say, objective,
-            tuple(zip(*tested)), **facts)
+        fit(net, geometry, motions, run, seed, device, checkpoint, say, objective, test, **facts)
         if held_out:
             evaluate(root, run, [s.name for s in held_out], run / "results", device, say=say,
                      network=network)
         say(f"weights       {run}/weights.pt\n"
-            f"next          python d3dlo.py eval --weights {run}"
-            + (f" --data {data}" if data else ""))
+            f"next          python d3dlo.py eval --weights {run}{f' --data {data}' * bool(data)}")
     return run
+
+
+def print_and_log(log, line):
+    """Print a line and append it to a log file."""
+    with open(log, "a", encoding="utf-8") as file:
+        file.write(line + "\n")
+    print(line, flush=True)
+
+
+def test_data(held_out, geometry):
+    """Geometry and motions of the test split's sequences with ground truth, () without any."""
+    test = [(records, s.motions()) for records, s in zip(geometry, held_out)
+            if s.name in SPLITS["test"] and s.poses is not None and len(s) > 1]
+    return tuple(zip(*test))
 
 
 def starting_point(run, resume, weights, config, network, seed):

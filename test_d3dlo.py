@@ -1685,7 +1685,7 @@ def test_a_training_run_whose_output_nobody_reads_is_resumed_to_the_same_weights
 def test_an_interruption_while_the_cache_is_made_leaves_no_run_to_resume(here, monkeypatch, capsys):
     def interrupt(*arguments):
         raise KeyboardInterrupt
-    write_root(here / "root", scans=2)
+    write_root(here / "root", scans=3)
     monkeypatch.setattr(kitti, "in_processes", interrupt)
     assert d3dlo.main("train --data root --out runs/run".split()) == 130
     line, = complaint(capsys.readouterr().err)

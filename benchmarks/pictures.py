@@ -1,15 +1,18 @@
 """Pictures for the documentation. Needs matplotlib: pip install ".[plot]"
 
+    python benchmarks/pictures.py network docs/network.png  # Fig. 1 with shapes and parameters
     python benchmarks/pictures.py method docs/method.png  # sampling and grouping of two scans
     python benchmarks/pictures.py method docs/method.png --data ROOT --sequence 00 --scan 100
-    python benchmarks/pictures.py curve curve.png runs/A runs/B  # training loss by epoch
+    python benchmarks/pictures.py curve docs/curve.png runs/A  # loss by epoch
 
-docs/trajectory.png is the plot.png of
+Trajectories and errors come from two evaluations of the same data, plain and refined:
 
-    python d3dlo.py eval --data data/full --sequences 04 05 06 --refine 2 --plot
+    python d3dlo.py eval --data ROOT --out P && python d3dlo.py eval --data ROOT --refine 2 --out R
+    python benchmarks/pictures.py paths docs/paths.png ROOT P R --sequences 03 04 06
+    python benchmarks/pictures.py steps docs/steps.png P R  # real drives 0013 and 0005
 """
 import argparse
-import itertools
+import json
 import re
 import sys
 from pathlib import Path
@@ -84,17 +87,121 @@ def method(root, name, i):
     return figure
 
 
-def curve(runs):
-    """The mean training loss of each epoch, from the logs of training runs."""
-    figure = metrics.picture(6, 3.5)
+def network():
+    """Fig. 1: the blocks with their outputs and parameters."""
+    net = d3dlo.D3DLO()
+    parameters = {name: sum(p.numel() for p in block.parameters())
+                  for name, block in net.named_children()}
+    figure = metrics.picture(11, 2.6)
     axis = figure.subplots()
-    line = re.compile(r"^epoch (\d+)/\d+: loss ([\d.]+)", re.M)
-    for run, style in zip(runs, itertools.cycle(("k-", "k--", "k:", "k-."))):
-        epochs = line.findall((run / "log.txt").read_text(encoding="utf-8"))
-        axis.plot(*np.array(epochs, float).reshape(-1, 2).T, style, label=run.name)
-    axis.set(xlabel="epoch", ylabel="mean loss, eq. 2", yscale="log")
+    axis.set(xlim=(0, 11), ylim=(0, 2.6))
+    axis.axis("off")
+
+    def box(x, y, name, title):
+        axis.text(x, y, f"{title}\n{parameters[name]:,}", ha="center", va="center",
+                  bbox=dict(boxstyle="round,pad=0.4", fc="#dbe7f3", ec="#4a6d8c"))
+
+    def arrow(start, end, label=""):
+        axis.annotate("", end, start, arrowprops=dict(arrowstyle="->", color="0.3"))
+        middle = np.mean([start, end], 0)
+        axis.text(middle[0], middle[1] + 0.14, label, ha="center", va="bottom", fontsize=8)
+
+    for y, scan in (2.1, "P"), (0.7, "Q"):
+        arrow((0.5, y), (1.65, y), "N x 4")
+        axis.text(0.3, y, scan, ha="center", va="center", fontsize=14)
+        box(1.9, y, "sa1", "SA1")
+        arrow((2.2, y), (3.5, 1.4 + 0.12 * np.sign(y - 1.4)), "1,024 x 32")
+    axis.text(1.9, 1.4, "shared weights", ha="center", va="center", fontsize=8)
+    blocks = {"fe": "flow embedding", "sa2": "SA2", "sa3": "SA3", "mpn": "mini-PointNet",
+              "mlp": "MLP"}
+    places = dict(zip(blocks, (4.2, 5.95, 7.2, 8.65, 10.05)))
+    outputs = dict(zip(blocks, ("1,024 x 64", "256 x 64", "64 x 64", "256", "6")))
+    begins, ends = (4.95, 6.3, 7.55, 9.35, 10.35), (5.65, 6.9, 7.95, 9.75, 10.75)
+    for (name, title), begin, end in zip(blocks.items(), begins, ends):
+        box(places[name], 1.4, name, title)
+        arrow((begin, 1.4), (end, 1.4), outputs[name])
+    axis.text(5.5, 0.2, f"{sum(parameters.values()):,} parameters. The output is a translation in "
+              "metres and three angles in degrees.", ha="center", fontsize=9)
+    return figure
+
+
+COLOURS = {"truth": "0.6", "plain": "tab:orange", "refined": "tab:blue", "KISS-ICP": "tab:green"}
+
+
+def paths(root, plain, refined, names):
+    """The true and the predicted paths of sequences from above, all to the same scale."""
+    drives = []
+    for s in kitti.open_sequences(root, names):
+        simulated = (s.folder / "simulated.json").exists()
+        files = [folder / f"{s.name}.txt" for folder in (plain, refined)]
+        poses = dict(zip(COLOURS, [s.poses_cam, *map(metrics.read_poses, files)]))
+        drives.append(("sim-" * simulated + s.name, poses))
+    figure = metrics.picture(4.2 * len(drives), 4.6)
+    axes = np.atleast_1d(figure.subplots(1, len(drives)))
+    points = [np.concatenate([T[:, :3, 3] for T in poses.values()]) for _, poses in drives]
+    half = 0.54 * max(np.ptp(xyz[:, [0, 2]], axis=0).max() for xyz in points)  # shared scale
+    for axis, (name, poses), xyz in zip(axes, drives, points):
+        truth = poses["truth"]
+        for label, T in poses.items():
+            axis.plot(T[:, 0, 3], T[:, 2, 3], color=COLOURS[label], label=label,
+                      lw=4 if label == "truth" else 1.4)
+        axis.plot(0, 0, "ko", ms=5)
+        drift = {label: np.linalg.norm((T - truth)[-1, :3, 3]) for label, T in poses.items()}
+        middle = (xyz.max(0) + xyz.min(0)) / 2
+        axis.set(title=f"{name}, {metrics.path_lengths(truth)[-1]:,.0f} m. Off at the end:\n"
+                 f"plain {drift['plain']:.1f} m, refined {drift['refined']:.1f} m",
+                 xlabel="x, right [m]", ylabel="z, forward [m]", aspect="equal",
+                 xlim=(middle[0] - half, middle[0] + half),
+                 ylim=(middle[2] - half, middle[2] + half))
+        axis.grid(color="0.9")
+    axes[0].legend(frameon=False)
+    return figure
+
+
+# Error of a step [m, deg]: KISS-ICP 1.3.0, and the noise of the ground truth [m]; docs/results.md
+KISS_ICP = {"drive0013": (0.026, 0.046), "drive0005": (0.032, 0.058)}
+TRUTH_NOISE = {"drive0013": 0.015, "drive0005": 0.024}
+
+
+def steps(plain, refined):
+    """Bars: the error of a step on the real drives, plain, refined and of KISS-ICP."""
+    results = {label: json.loads((folder / "results.json").read_text())["sequences"]
+               for label, folder in (("plain", plain), ("refined", refined))}
+    figure = metrics.picture(8, 3)
+    for k, (axis, unit) in enumerate(zip(figure.subplots(1, 2), ("cm", "deg"))):
+        for i, label in enumerate(("plain", "refined", "KISS-ICP")):
+            heights = [KISS_ICP[name][k] if label == "KISS-ICP" else
+                       results[label][name][("t_step_m", "r_step_deg")[k]] for name in KISS_ICP]
+            heights = np.array(heights) * (100 if unit == "cm" else 1)
+            axis.bar(np.arange(2) + 0.27 * (i - 1), heights, 0.25, color=COLOURS[label],
+                     label=label)
+        axis.set(xticks=range(2), xticklabels=[f"real {name}" for name in KISS_ICP],
+                 ylabel=f"mean error of a step [{unit}]")
+        axis.grid(axis="y", color="0.9")
+        axis.set_axisbelow(True)
+        if unit == "cm":
+            for i, name in enumerate(TRUTH_NOISE):
+                axis.plot([i - 0.42, i + 0.42], [100 * TRUTH_NOISE[name]] * 2, "k--", lw=1,
+                          label="noise of the ground truth" if i == 0 else None)
+            axis.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def curve(run):
+    """The mean training loss of each epoch, and the loss on test sequences, from a run's log."""
+    log = (run / "log.txt").read_text(encoding="utf-8")
+    epochs = re.findall(r"^epoch (\d+)/\d+: loss ([\d.]+)(?:, test loss ([\d.]+))?", log, re.M)
+    if not epochs:
+        raise ValueError(f"{run}/log.txt: holds no epoch")
+    epoch, training, test = np.array([[x or "nan" for x in row] for row in epochs], float).T
+    figure = metrics.picture(6, 3.3)
+    axis = figure.subplots()
+    axis.plot(epoch, training, "o-", color="tab:orange", label="training, augmented")
+    if not np.isnan(test).all():
+        axis.plot(epoch, test, "o-", color="tab:blue", label="test sequences")
+    axis.set(xlabel="epoch", ylabel="mean loss, eq. 2 [m and deg]", ylim=(0, None))
     axis.legend(frameon=False)
-    axis.grid(color="0.9", which="both")
+    axis.grid(color="0.9")
     return figure
 
 
@@ -109,16 +216,33 @@ def main():
         "folder in KITTI odometry layout (default: the simulated city)"))
     m.add_argument("--sequence", default="03", metavar="NN", help="default: 03")
     m.add_argument("--scan", type=int, default=60, metavar="N", help="default: 60")
-    c = commands.add_parser("curve", help="training loss by epoch")
+    n = commands.add_parser("network", help="the network as in Fig. 1")
+    n.add_argument("picture", type=Path)
+    p = commands.add_parser("paths", help="true and predicted paths from above")
+    p.add_argument("picture", type=Path)
+    p.add_argument("data", metavar="ROOT", help="folder in KITTI odometry layout")
+    p.add_argument("--sequences", nargs="+", default=["all"], metavar="NN", help="default: all")
+    b = commands.add_parser("steps", help="error of a step on the real drives")
+    b.add_argument("picture", type=Path)
+    for command in (p, b):
+        command.add_argument("plain", type=Path, metavar="P", help="folder written by eval")
+        command.add_argument("refined", type=Path, metavar="R", help="by eval --refine 2")
+    c = commands.add_parser("curve", help="loss by epoch")
     c.add_argument("picture", type=Path)
-    c.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folder of a training run")
+    c.add_argument("run", type=Path, metavar="RUN", help="folder of a training run")
     args = parser.parse_args()
     try:
         if args.command == "method":
             root = args.data or kitti.simulate(d3dlo.SIMULATED, sequences=[args.sequence])
             figure = method(root, args.sequence, args.scan)
+        elif args.command == "network":
+            figure = network()
+        elif args.command == "paths":
+            figure = paths(args.data, args.plain, args.refined, args.sequences)
+        elif args.command == "steps":
+            figure = steps(args.plain, args.refined)
         else:
-            figure = curve(args.runs)
+            figure = curve(args.run)
         with metrics.replacing(args.picture) as temporary:
             figure.savefig(temporary, format="png", dpi=100)
     except (ValueError, OSError) as error:
