@@ -960,12 +960,13 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
 def clear_results(out):
     """Delete what an earlier evaluation wrote to the folder OUT, as its results.json lists it."""
     try:
-        files = json.loads((out / "results.json").read_text(encoding="utf-8"))["files"]
+        content = json.loads((out / "results.json").read_text(encoding="utf-8"))
+        files = [Path(name) for name in content["files"]]
     except (OSError, ValueError, KeyError, TypeError):  # none, or not one of ours
         return
-    for name in [*files, "results.json"]:
-        if Path(name).name == name and (out / name).is_file():
-            (out / name).unlink()
+    for path in [*files, Path("results.json")]:
+        if path.name == str(path) and (out / path).is_file():
+            (out / path).unlink()
 
 
 def zip_for_server(out):

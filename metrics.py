@@ -256,7 +256,11 @@ def main(argv=None):
     args = parser.parse_args(argv)
     rows, segments, steps, trajectories = [], [], [], {}
     try:
-        for name, (gt, est) in _pairs_of_files(args.gt, args.est).items():
+        pairs = _pairs_of_files(args.gt, args.est)
+        inputs = {path.resolve() for pair in pairs.values() for path in pair}
+        if args.plot and args.plot.resolve() in inputs:
+            raise ValueError(f"--plot {args.plot}: is one of the pose files; choose another name")
+        for name, (gt, est) in pairs.items():
             T_gt, T_est = trajectories[name] = read_poses(gt), read_poses(est)
             if len(T_gt) != len(T_est):
                 raise ValueError(f"{est}: {len(T_est)} poses, but {gt} has {len(T_gt)}; both must cover the same scans")

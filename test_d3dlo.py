@@ -1,6 +1,7 @@
 """Properties of D3DLO. Every expectation comes from an independent source: brute force, SciPy, a definition written out, or a closed
 form. Real data are optional: D3DLO_KITTI names a folder in KITTI odometry layout; without it those tests are skipped."""
-import argparse, contextlib, copy, errno, io, json, math, os, pickle, re, runpy, shutil, signal, subprocess, sys, time, warnings, zipfile
+import argparse, contextlib, copy, errno, io, json, math, os, pickle, re, runpy, shutil, signal
+import subprocess, sys, time, warnings, zipfile
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -172,7 +173,8 @@ def test_the_radius_of_a_ball_is_inclusive(r):
 def test_group_knn_equals_brute_force(seed, kind, N, k):
     rng = generator(seed)
     xyz, query = points(rng, kind, N), points(rng, kind, 20)
-    for d, row in zip(cdist(query.astype(float), xyz.astype(float)), group_knn(xyz, query, k), strict=True):
+    D = cdist(query.astype(float), xyz.astype(float))
+    for d, row in zip(D, group_knn(xyz, query, k), strict=True):
         assert_allclose(d[row[:N]], np.sort(d)[:k], rtol=1e-12, atol=1e-12)
         assert len(set(row[:N])) == min(k, N) and len(row) == k
         assert_array_equal(row[N:], row[0])             # fewer than k points: the nearest once more
@@ -185,7 +187,8 @@ def test_neighbours_by_a_matrix_are_those_of_the_tree(seed, kind, N, k):
     xyz, query = (torch.from_numpy(np.stack(part)) for part in zip(*clouds))
     for (y, x), rows in zip(clouds, d3dlo.knn_by_matrix(query, xyz, k), strict=True):
         D = cdist(x.astype(float), y.astype(float))
-        expected, got = (np.take_along_axis(D, idx, 1) for idx in (group_knn(y, x, k), rows.numpy()))
+        expected = np.take_along_axis(D, group_knn(y, x, k), 1)
+        got = np.take_along_axis(D, rows.numpy(), 1)
         assert_allclose(got, expected, atol=1e-4)
         assert all(len(set(row.tolist())) == min(k, N) for row in rows)
         assert (rows[:, N:] == rows[:, :1]).all() and rows.shape == (20, k)
@@ -265,7 +268,7 @@ def test_the_default_config_is_the_papers():
                      plane=True, augment=False, frozen=0)
     default = vars(Config())
     assert table_1.items() | section_4.items() <= default.items()
-    assert default.keys() - (table_1 | section_4).keys() == {"batch", "lr"}  # the paper does not say
+    assert default.keys() - (table_1 | section_4).keys() == {"batch", "lr"}  # not in the paper
     adam, = d3dlo.make_optimizers(D3DLO(), d3dlo.UnweightedLoss())
     assert type(adam) is torch.optim.Adam
     assert adam.defaults == torch.optim.Adam([torch.zeros(1)]).defaults  # "with default values"
@@ -415,10 +418,10 @@ def test_sixteen_pairs_can_be_learned_by_heart(tmp_path, frozen):
     config, said = replace(SMALL, epochs=300, lr=1e-2, schedule="one-cycle", frozen=frozen), []
     torch.manual_seed(0)
     net = d3dlo.fit(D3DLO(config), geometry, motions, tmp_path, say=said.append, **FACTS)
-    before, in_training, in_use = (float(re.search(r"[\d.]{6}", line)[0]) for line in (said[0], said[-2], said[-1]))
-    assert before > 0.3 and in_training < 0.02 and in_use < 0.02                    # eq. 2, m and degrees alike
+    before, in_training, in_use = (float(re.search(r"[\d.]{6}", said[i])[0]) for i in (0, -2, -1))
+    assert before > 0.3 and in_training < 0.02 and in_use < 0.02  # eq. 2, m and degrees alike
     got = to_vector(np.concatenate([d3dlo.predict_motions(net, records) for records in geometry]))
-    assert np.abs(got - to_vector(np.concatenate(motions))).mean() < 0.02           # and by the path that odometry takes
+    assert np.abs(got - to_vector(np.concatenate(motions))).mean() < 0.02  # as odometry predicts
 
 
 @given(SEED, st.sampled_from(["both", "random"]), st.booleans(), st.integers(2, 12))
@@ -470,14 +473,18 @@ def test_batches_of_one_directed_pair_are_refused(batch, pairs):
 def test_augmented_pairs_still_fit_their_motion(seed):
     rng = generator(seed)
     geometry, motions = pairs_of_scans(rng, 6, points=200, config=SMALL)
-    assert all(g[0]["idx2"].tobytes() == g[1]["idx2"].tobytes() for g in geometry)  # Q is P moved: the same points in the same order
+    for p, q in geometry:  # Q is P moved: the same points in the same order
+        assert_array_equal(p["idx2"], q["idx2"])
     before, T = np.stack([g[d] for d in (0, 1) for g in geometry]), np.concatenate(motions)
     clouds, T_new = d3dlo.augment(before, T, rng)
     for p, q, old, X, Y in zip(clouds[:6], clouds[6:], before[:6], T_new, T):
         assert_allclose(move(X, q["xyz"]), p["xyz"], atol=1e-4)
-        assert_allclose(move(X, q["xyz"][:, None] + q["group"][..., 1:]), p["xyz"][:, None] + p["group"][..., 1:], atol=1e-4)
-        assert np.linalg.det(X[:3, :3]) > 0.999 and np.abs(X - Y).max() > 1e-3      # no reflection is left, and something moved
-        assert_array_equal(p["xyz"] * [1, np.sign(p["xyz"][0, 1] * old["xyz"][0, 1]), 1], old["xyz"])
+        near_p, near_q = (c["xyz"][:, None] + c["group"][..., 1:] for c in (p, q))
+        assert_allclose(move(X, near_q), near_p, atol=1e-4)
+        assert np.linalg.det(X[:3, :3]) > 0.999  # no reflection is left
+        assert np.abs(X - Y).max() > 1e-3  # something moved
+        left_to_right = np.sign(p["xyz"][0, 1] * old["xyz"][0, 1])
+        assert_array_equal(p["xyz"] * [1, left_to_right, 1], old["xyz"])
     before["xyz"], before["group"][..., 1:] = clouds["xyz"], clouds["group"][..., 1:]
     assert before.tobytes() == clouds.tobytes()         # nothing else has changed
 
@@ -621,10 +628,11 @@ def test_learning_rates_drop_to_a_tenth_at_epochs_300_and_400_of_500(tmp_path):
 
 @pytest.mark.parametrize("frozen", [0, 0.5])
 def test_statistics_are_recomputed_at_the_end_unless_they_were_fixed(tmp_path, frozen):
-    geometry, motions = drives()  # all 10 pairs in each batch, so all batches have the same statistics
+    geometry, motions = drives()  # all 10 pairs in each batch: all have the same statistics
     config = replace(SMALL, epochs=6, batch=10, lr=1e-2, frozen=frozen)
     fit(tmp_path, config)
-    weights, checkpoint = (stored(tmp_path, name)["model"] for name in ("weights.pt", "checkpoint.pt"))
+    weights, checkpoint = (stored(tmp_path, f"{name}.pt")["model"]
+                           for name in ("weights", "checkpoint"))
     if frozen:  # trained with these statistics
         assert all(torch.equal(tensor, checkpoint[name]) for name, tensor in weights.items())
         return
@@ -1313,17 +1321,20 @@ NAN = float("nan")
 
 @table("settings, named", {str(settings): (settings, named) for settings, named in [
     (dict(epochs=1.5), "epochs"), (dict(epochs=0), "epochs"), (dict(batch=NAN), "batch"),
-    (dict(sa1=Config.sa1._replace(r=-1.0)), "radius"), (dict(sa2=Config.sa2._replace(r=NAN)), "radius"),
+    (dict(sa1=Config.sa1._replace(r=-1.0)), "radius"),
+    (dict(sa2=Config.sa2._replace(r=NAN)), "radius"),
     (dict(sa3=Config.sa3._replace(r=0)), "radius"), (dict(max_range=-50.0), "max_range"),
     (dict(max_range=NAN), "max_range"), (dict(max_range=0), "max_range"), (dict(lr=NAN), "lr"),
     (dict(lr=-1e-3), "lr"), (dict(lr=float("inf")), "lr"), (dict(frozen=1.0), "frozen"),
     (dict(frozen=-0.1), "frozen"), (dict(frozen=NAN), "frozen"),
-    (dict(sa1=Config.sa1._replace(n_n=99999999)), "n_n"), (dict(fe=Config.fe._replace(n_n=0)), "n_n"),
+    (dict(sa1=Config.sa1._replace(n_n=99999999)), "n_n"),
+    (dict(fe=Config.fe._replace(n_n=0)), "n_n"),
     (dict(sa1=Config.sa1._replace(n_fps=65536)), "n_fps"),
     (dict(sa3=Config.sa3._replace(n_fps=257)), "n_fps"), (dict(plane="no"), "plane"),
     (dict(augment=2), "augment"), (dict(optimizer="sgd"), "optimizer"),
     (dict(schedule="cosine"), "schedule"), (dict(swap="always"), "swap"),
-    (dict(mlp=Layer(None, None, None, (64, 7))), "mlp"), (dict(mpn=Layer(None, None, None, ())), "MLP")]})
+    (dict(mlp=Layer(None, None, None, (64, 7))), "mlp"),
+    (dict(mpn=Layer(None, None, None, ())), "MLP")]})
 def test_a_config_that_makes_no_sense_is_refused_by_name(settings, named):
     with pytest.raises(ValueError, match=rf"Config: .*{named}"):
         Config(**settings)
@@ -1486,19 +1497,26 @@ def test_train_then_eval_then_train_again(here, city, capsys):
     assert d3dlo.main(arguments) == 0
     out, err = capsys.readouterr()
     assert complaint(err) == [] and "61,290 parameters" in out and not list(here.rglob(".*"))
-    assert {"weights.pt", "checkpoint.pt", "config.json", "lock", "log.txt", "results"} == set(os.listdir("run"))
-    trained, before = json.loads((here / "run" / "results" / "results.json").read_text()), (here / "run" / "checkpoint.pt").read_bytes()
-    assert figures(out, "07") == as_printed(trained["sequences"]["07"]) and (here / "run" / "log.txt").read_text() == out
+    run = here / "run"
+    assert set(os.listdir(run)) == {
+        "weights.pt", "checkpoint.pt", "config.json", "lock", "log.txt", "results"}
+    trained = json.loads((run / "results" / "results.json").read_text())
+    before = (run / "checkpoint.pt").read_bytes()
+    assert figures(out, "07") == as_printed(trained["sequences"]["07"])
+    assert (run / "log.txt").read_text() == out
     assert d3dlo.main(["eval", "--data", "data", "--weights", "run", "--out", "out"]) == 0
     results, out = json.loads((here / "out" / "results.json").read_text()), capsys.readouterr().out
-    assert results["sequences"]["07"] == trained["sequences"]["07"]                 # it was held out, and evaluated at the end
-    assert [s["trained_on"] for s in results["sequences"].values()] == [True, False] and re.search(r"^00 \*", out, re.M)
-    assert results["pooled"]["trained_on"] and re.search(r"^all \*", out, re.M)  # one was
-    fails_with_one_line(d3dlo.main, arguments, "--resume", capsys)                  # never over an earlier training
+    assert results["sequences"]["07"] == trained["sequences"]["07"]  # held out, evaluated at the end
+    assert [s["trained_on"] for s in results["sequences"].values()] == [True, False]
+    assert results["pooled"]["trained_on"]  # on one of them
+    assert re.findall(r"^(\w+) \*", out, re.M) == ["00", "train", "all"]
+    fails_with_one_line(d3dlo.main, arguments, "--resume", capsys)  # it is not overwritten
     shutil.copy("data/poses/07.txt", "data/poses/00.txt")
-    fails_with_one_line(d3dlo.main, ["train", "--out", "run", "--resume"], "the data have changed", capsys)
-    assert (here / "run" / "checkpoint.pt").read_bytes() == before
-    fails_with_one_line(d3dlo.main, ["eval", "--data", "data", "--weights", "run/checkpoint.pt"], "weights.pt beside", capsys)
+    resume = "train --out run --resume".split()
+    fails_with_one_line(d3dlo.main, resume, "the data have changed", capsys)
+    assert (run / "checkpoint.pt").read_bytes() == before
+    arguments = "eval --data data --weights run/checkpoint.pt".split()
+    fails_with_one_line(d3dlo.main, arguments, "weights.pt beside", capsys)
     shutil.copy("run/weights.pt", "run/checkpoint.pt")
     fails_with_one_line(d3dlo.main, ["train", "--out", "run", "--resume"], "no training", capsys)
 
@@ -1584,6 +1602,9 @@ def test_eval_used_again_removes_what_the_earlier_evaluation_listed_and_nothing_
     (here / "out" / "results.json").write_text(json.dumps(content))
     assert evaluate("03") == {"03.txt", "results.json", "notes.txt", "00.txt"}
     assert (here / "root" / "notes.txt").read_text() == "mine" and (here / "w.pt").exists()
+    for content in ("[]", '{"files": null}', '{"files": [1]}', "no JSON"):  # not one of ours
+        (here / "out" / "results.json").write_text(content)
+        assert evaluate("03") == {"03.txt", "results.json", "notes.txt", "00.txt"}
 
 
 def test_eval_refines_as_often_as_asked(here):
@@ -1592,7 +1613,7 @@ def test_eval_refines_as_often_as_asked(here):
     records = np.stack([scan_geometry(s.scan(i), SMALL) for i in range(6)])
     assert d3dlo.main("eval --data root --weights w.pt --refine 2 --out out".split()) == 0
     got = kitti.camera_to_velo(metrics.read_poses("out/00.txt"), s.Tr)
-    plain, _, twice = (d3dlo.accumulate(d3dlo.predict_motions(net, records, refine=n)) for n in range(3))
+    plain, twice = (d3dlo.accumulate(d3dlo.predict_motions(net, records, refine=n)) for n in (0, 2))
     assert_allclose(got, twice, atol=1e-3)
     assert np.abs(got - plain).max() > 0.1
 
@@ -1603,7 +1624,8 @@ def test_the_baselines_stand_still_or_repeat_the_mean_motion_of_training(here, c
     save_weights("w.pt", SMALL, mean_motion=mean)
     assert d3dlo.main("eval --data root --weights w.pt --out out".split()) == 0
     out, results = capsys.readouterr().out, json.loads((here / "out" / "results.json").read_text())
-    for name, motion in {"standing still": np.eye(4), "mean motion of training": by_hand(mean)}.items():
+    for name, v in {"standing still": [0] * 6, "mean motion of training": mean}.items():
+        motion = by_hand(np.array(v))
         T = [np.linalg.matrix_power(motion, i) for i in range(15)]
         errors = np.linalg.inv(motion) @ s.motions()
         steps = [np.linalg.norm(errors[:, :3, 3], axis=1),
@@ -1638,7 +1660,8 @@ def test_the_seed_sets_the_first_weights_and_the_mean_motion_is_stored(here):
 def test_a_run_folder_in_use_is_refused_in_one_line_that_names_the_process(here):
     write_root(here / "root", scans=2)
     with kitti.run_folder(here / "run"):
-        ran = subprocess.run([sys.executable, HERE / "d3dlo.py", *"train --data root --out run".split()],
+        arguments = "train --data root --out run".split()
+        ran = subprocess.run([sys.executable, HERE / "d3dlo.py", *arguments],
                              capture_output=True, text=True, timeout=60)
     line, = complaint(ran.stderr)
     assert ran.returncode == 2 and f"process {os.getpid()} on" in line and "run:" in line
@@ -1695,8 +1718,8 @@ def test_a_full_disk_is_said_in_one_line(here, monkeypatch, capsys):
     write_root(here / "root", size=60)
     save_weights("w.pt", SMALL)
     monkeypatch.setattr(np, "savetxt", full)
-    arguments = "eval --data root --weights w.pt --out out"
-    fails_with_one_line(d3dlo.main, arguments.split(), "No space left on device: 'out/00.txt'", capsys)
+    arguments, words = "eval --data root --weights w.pt --out out", "No space left on device: 'out/"
+    fails_with_one_line(d3dlo.main, arguments.split(), words + "00.txt'", capsys)
 
 
 def test_the_version_is_printed(capsys):
@@ -1743,15 +1766,27 @@ def test_bad_data_is_named_in_one_line_and_leaves_nothing_behind(here, weights, 
     assert [name for name in files_of(here) if not name.startswith("root/")] == []
 
 
-@pytest.mark.parametrize("arguments, words", {       # and what the complaint must name; without --data there is the simulated city
-    "eval --data root --sequences 42": "42", "eval --data root --sequences ../sequences/00": "../sequences/00", "eval --data gone": "gone",
-    "eval --data root --weights gone.pt": "gone.pt", "eval --data root --weights root": "root/weights.pt", "eval --sequences 0O": "0O",
-    "eval --data root --device nonsense": "nonsense", "train --resume": "--out", "train --resume --out gone": "gone",
-    "train --data root --sequences test": "test", "train --sequences 00 0O": "0O", "train --data root --weights gone.pt": "gone.pt",
-    "train --data root --weights gone.pt --no-plane": "--no-plane", "train --data root --lr 0": "lr",
-    "train --data root --lr nan": "lr", "train --data root --neighbors 99999999": "n_n",
-    f"train --data root --seed {10**23}": "seed", "train --data root --seed -1": "seed",
-    "eval --data root --refine -1": "refine", "eval --data root --device meta": "--device meta",
+@pytest.mark.parametrize("arguments, words", {  # words: what the complaint must name
+    "eval --data root --sequences 42": "42",
+    "eval --data root --sequences ../sequences/00": "../sequences/00",
+    "eval --data gone": "gone",
+    "eval --data root --weights gone.pt": "gone.pt",
+    "eval --data root --weights root": "root/weights.pt",
+    "eval --sequences 0O": "0O",  # of the simulated city
+    "eval --data root --device nonsense": "nonsense",
+    "eval --data root --device meta": "--device meta",
+    "eval --data root --refine -1": "refine",
+    "train --resume": "--out",
+    "train --resume --out gone": "gone",
+    "train --data root --sequences test": "test",
+    "train --sequences 00 0O": "0O",
+    "train --data root --weights gone.pt": "gone.pt",
+    "train --data root --weights gone.pt --no-plane": "--no-plane",
+    "train --data root --lr 0": "lr",
+    "train --data root --lr nan": "lr",
+    "train --data root --neighbors 99999999": "n_n",
+    f"train --data root --seed {10**23}": "seed",
+    "train --data root --seed -1": "seed",
     "train --data root --device meta": "--device meta",
 }.items())
 def test_bad_arguments_are_named_in_one_line(here, capsys, arguments, words):
@@ -1783,7 +1818,8 @@ def test_files_that_are_no_weights_are_named_in_one_line_and_run_no_code(here, c
 
 def test_metrics_on_the_command_line(here, capsys):
     gt, est = straight(300), straight(300, 1.01)
-    for name, T in {"gt/03": gt, "gt/07": gt[:200], "est/03": est, "est/07": gt[:200], "short": gt[:20]}.items():
+    files = {"gt/03": gt, "gt/07": gt[:200], "est/03": est, "est/07": gt[:200], "short": gt[:20]}
+    for name, T in files.items():
         metrics.write_poses(f"{name}.txt", T)
     assert metrics.main(["short.txt", "short.txt"]) == 0
     assert figures(capsys.readouterr().out, "short")[:4] == ["0", "-", "-", "0.0000"]
@@ -1791,13 +1827,25 @@ def test_metrics_on_the_command_line(here, capsys):
     expected, out = devkit(gt, est)[:, 3], capsys.readouterr().out
     ate = math.sqrt(sum((0.01 * i) ** 2 for i in range(300)) / 300)
     assert figures(out, "03")[5:] == [f"{ate:.3f}", "0.0100", "0.0000"]
-    assert figures(out, "03")[:5] == [str(len(expected)), f"{expected.mean():.3f}", "0.00000", "0.0100", "0.0000"]
+    E_t = f"{expected.mean():.3f}"
+    assert figures(out, "03")[:5] == [str(len(expected)), E_t, "0.00000", "0.0100", "0.0000"]
     assert figures(out, "100 m")[1] == "1.010" and figures(out, "200 m")[1] == "1.005"
     assert metrics.main(["gt", "est"]) == 0
-    pooled = np.r_[expected, devkit(gt[:200], gt[:200])[:, 3]]                      # 07 is shorter, and without error
+    pooled = np.r_[expected, devkit(gt[:200], gt[:200])[:, 3]]  # 07 is shorter, and without error
     assert figures(capsys.readouterr().out, "all")[1] == f"{pooled.mean():.3f}"
-    for bad in (["gt/03.txt", "gone.txt"], ["gt/03.txt", "short.txt"], ["gt", "est/03.txt"], ["gt", str(here)]):
+    for bad in (["gt/03.txt", "gone.txt"], ["gt/03.txt", "short.txt"], ["gt", "est/03.txt"],
+                ["gt", str(here)]):
         fails_with_one_line(metrics.main, bad, bad[1], capsys)
+
+
+def test_a_picture_never_replaces_the_poses_it_is_drawn_from(here, capsys):
+    for name in ("gt/00", "est/00"):
+        metrics.write_poses(f"{name}.txt", straight(5))
+    before = files_of(here)
+    for pair in (["gt/00.txt", "est/00.txt"], ["gt", "est"]):
+        for plot in ("gt/00.txt", "est/../est/00.txt"):
+            fails_with_one_line(metrics.main, [*pair, "--plot", plot], "--plot", capsys)
+    assert files_of(here) == before
 
 
 def test_simulate_on_the_command_line(here, city, capsys):
