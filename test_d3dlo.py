@@ -2296,20 +2296,19 @@ def test_a_rejected_network_is_trained_stored_loaded_resumed_and_evaluated(here,
 
 # ------------------------------------------------------------------------------------------------------------- the readme
 
-def test_the_readme_s_python_runs_and_its_commands_parse(here, monkeypatch):
+def test_the_python_of_the_documentation_runs_and_its_commands_parse(here, monkeypatch):
     def parse_only(parser, arguments=None, parse=argparse.ArgumentParser.parse_args):
-        parse(parser, arguments)                        # SystemExit(2) when it does not like them
+        parse(parser, arguments)  # SystemExit(2) when it does not like them
         raise SystemExit("parsed")
-    text = (HERE / "README.md").read_text(encoding="utf-8")
+    pages = [HERE / "README.md", *sorted(HERE.glob("docs/*.md"))]
+    text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
     for block in re.findall(r"```python\n(.*?)```", text, re.S):
-        exec(compile(block, "README.md", "exec"), {})
+        exec(compile(block, "a page", "exec"), {})
     commands = re.findall(r"^(?:pip install \S+ && )?python (\S+\.py)([^#\n]*)", text, re.M)
     commands += re.findall(r"`python (\S+\.py)([^`]*)`", text)
-    assert len(commands) > 12
+    assert len(commands) > 20
     monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse_only)
     for script, arguments in commands:
         monkeypatch.setattr(sys, "argv", [script, *arguments.split()])
-        if "pictures" in script:
-            pytest.importorskip("matplotlib")
         with pytest.raises(SystemExit, match="parsed"):
             runpy.run_path(str(HERE / script), run_name="__main__")
