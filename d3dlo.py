@@ -97,8 +97,8 @@ class Config:
 
     def __post_init__(self):
         for name in ("sa1", "fe", "sa2", "sa3", "mpn", "mlp"):  # JSON turned tuples into lists
-            r, n_fps, n_n, mlp = getattr(self, name)
-            object.__setattr__(self, name, Layer(r, n_fps, n_n, tuple(mlp)))
+            *numbers, mlp = getattr(self, name)
+            object.__setattr__(self, name, Layer(*numbers, tuple(mlp)))
         check_config(self)
 
     def as_dict(self):
@@ -194,9 +194,9 @@ def geometry_dtype(config):
     n1, n2, n3 = config.sa1.n_fps, config.sa2.n_fps, config.sa3.n_fps
     return np.dtype([
         ("xyz", "f4", (n1, 3)),  # centroids of SA1; the first n2 are SA2's, the first n3 SA3's
-        ("group", "f4", (n1, config.sa1.n_n, 4)),  # SA1's neighbours: intensity f_i, x_i - x'_j [m]
-        ("idx2", "u2", (n2, config.sa2.n_n)),  # SA2's neighbours, indices into SA1's centroids
-        ("idx3", "u2", (n3, config.sa3.n_n)),  # SA3's neighbours, indices into SA2's centroids
+        ("group_sa1", "f4", (n1, config.sa1.n_n, 4)),  # SA1's neighbours: f_i, x_i - x'_j [m]
+        ("idx_sa2", "u2", (n2, config.sa2.n_n)),  # SA2's neighbours, indices into SA1's centroids
+        ("idx_sa3", "u2", (n3, config.sa3.n_n)),  # SA3's neighbours, indices into SA2's centroids
         ("broken", "i4"),  # number of points dropped that cannot be measurements
         ("stats", "f4", len(kitti.STATS)),  # scan statistics, to warn about domain shift
     ])
@@ -222,11 +222,11 @@ def scan_geometry(scan: np.ndarray, config: Config = Config()) -> np.ndarray:
 
     out = np.zeros((), geometry_dtype(config))
     out["xyz"] = xyz = cloud[centroids]  # (n1,3)
-    out["group"][..., 0] = scan[neighbours, 3]  # (n1,k1)
-    out["group"][..., 1:] = cloud[neighbours] - xyz[:, None]  # (n1,k1,3)
+    out["group_sa1"][..., 0] = scan[neighbours, 3]  # (n1,k1)
+    out["group_sa1"][..., 1:] = cloud[neighbours] - xyz[:, None]  # (n1,k1,3)
     first_n2, first_n3 = np.arange(sa2.n_fps), np.arange(sa3.n_fps)
-    out["idx2"] = group_ball(xyz, first_n2, sa2.r, sa2.n_n)
-    out["idx3"] = group_ball(xyz[first_n2], first_n3, sa3.r, sa3.n_n)
+    out["idx_sa2"] = group_ball(xyz, first_n2, sa2.r, sa2.n_n)
+    out["idx_sa3"] = group_ball(xyz[first_n2], first_n3, sa3.r, sa3.n_n)
     out["broken"], out["stats"] = broken, kitti.scan_stats(scan, xyz)
     return out
 
@@ -238,9 +238,9 @@ class Batch(NamedTuple):
     """
 
     xyz: torch.Tensor  # (C,n1,3) centroids
-    group: torch.Tensor  # (C,n1,k1,4)
-    idx2: torch.Tensor  # (C,n2,k2)
-    idx3: torch.Tensor  # (C,n3,k3)
+    group_sa1: torch.Tensor  # (C,n1,k1,4)
+    idx_sa2: torch.Tensor  # (C,n2,k2)
+    idx_sa3: torch.Tensor  # (C,n3,k3)
     p: torch.Tensor  # (B,) index of P among the scans
     q: torch.Tensor  # (B,) index of Q among the scans
     idx_fe: torch.Tensor  # (B,n1,k) neighbours in Q of each centroid of P
@@ -248,8 +248,8 @@ class Batch(NamedTuple):
 
 def make_batch(scans, p, q, config, device="cpu"):
     """Records of scans (C,) and index arrays p, q (B,) -> Batch."""
-    idx2, idx3 = scans["idx2"].astype(np.int64), scans["idx3"].astype(np.int64)  # for torch
-    arrays = scans["xyz"], scans["group"], idx2, idx3, p, q
+    indices = (scans[name].astype(np.int64) for name in ("idx_sa2", "idx_sa3"))  # torch's type
+    arrays = scans["xyz"], scans["group_sa1"], *indices, p, q
     xyz, *others = (to_device(array, device) for array in arrays)
     idx_fe = neighbours_in_q(xyz, p, q, config.fe.n_n)  # `group_knn` for every pair
     return Batch(xyz, *others, idx_fe)
@@ -338,15 +338,15 @@ class D3DLO(nn.Module):
         """Batch -> y_hat (B,6): [tx, ty, tz] in metres, [roll, pitch, yaw] in degrees, of T_pq."""
         p, q = batch.p, batch.q
         # SA1 for every scan, eq. 3; scan_geometry has gathered its neighbours.
-        features = self.sa1.mpn(batch.group)  # (C,1024,32)
+        features = self.sa1.mpn(batch.group_sa1)  # (C,1024,32)
         # FE for every pair, eq. 4. (The backward pass of index_select is faster than of [p].)
         x, f = batch.xyz[p], features.index_select(0, p)  # (B,1024,3), (B,1024,32) of P
         y, g = batch.xyz[q], features.index_select(0, q)  # (B,1024,3), (B,1024,32) of Q
         e = self.fe(x, f, y, g, batch.idx_fe)  # (B,1024,64)
         # SA2 and SA3 on P, eq. 3
-        e = self.sa2(x, e, batch.idx2[p])  # (B,256,64)
+        e = self.sa2(x, e, batch.idx_sa2[p])  # (B,256,64)
         x = x[:, :self.config.sa2.n_fps]  # (B,256,3)
-        e = self.sa3(x, e, batch.idx3[p])  # (B,64,64)
+        e = self.sa3(x, e, batch.idx_sa3[p])  # (B,64,64)
         # Mini-PointNet and MLP
         global_feature = self.mpn(e)  # (B,256)
         return self.mlp(global_feature)  # (B,6)
@@ -372,8 +372,8 @@ def move_scans(scans, T):
     moved, T = scans.copy(), T.astype(np.float32)
     R, t = T[:, :3, :3].transpose(0, 2, 1), T[:, None, :3, 3]  # points are rows: x R^T + t
     moved["xyz"] = scans["xyz"] @ R + t
-    offsets = scans["group"][..., 1:]  # (C,n1,k1,3)
-    moved["group"][..., 1:] = (offsets.reshape(len(T), -1, 3) @ R).reshape(offsets.shape)
+    offsets = scans["group_sa1"][..., 1:]  # (C,n1,k1,3)
+    moved["group_sa1"][..., 1:] = (offsets.reshape(len(T), -1, 3) @ R).reshape(offsets.shape)
     return moved
 
 
@@ -517,12 +517,14 @@ class Training:
         """A copy of the network in eval mode, and its twin for the device.
 
         BatchNorm's running statistics lag behind the weights, so they are recomputed, unless they
-        were fixed before and the weights were trained with them.
+        were fixed before and the weights were trained with them. FloatingPointError when a weight
+        or a statistic is not finite.
         """
         net = copy.deepcopy(self.net)
         twin = for_device(net, self.device)
         if self.step <= self.frozen_from:
             update_bn(self.examples(), twin)
+        require_finite(sum(tensor.double().sum().item() for tensor in net.state_dict().values()))
         return net.eval(), twin.eval()
 
     def learning_rate(self):
@@ -573,10 +575,10 @@ def targets(net, batch, T):
     return to_device(net.encode(T).astype(np.float32), batch.xyz.device)
 
 
-def require_finite(loss):
-    """FloatingPointError unless a loss is a finite number."""
-    if not math.isfinite(loss):
-        raise FloatingPointError("the loss is not finite")
+def require_finite(number):
+    """FloatingPointError unless a loss, or a sum of weights, is a finite number."""
+    if not math.isfinite(number):
+        raise FloatingPointError("the loss or a weight is not finite")
 
 
 @torch.inference_mode()
@@ -606,6 +608,7 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", checkpoint=None, say=
     RUN/weights.pt are written; training continues from the content of a `checkpoint`. Ctrl-C lets
     the step under way finish. ValueError when the loss is not finite; nothing is stored then.
     """
+    facts = facts or training_facts({}, motions, geometry)
     training = Training(net, geometry, motions, run, seed, device, objective, **facts)
     if checkpoint:
         training.load(checkpoint)
@@ -627,8 +630,9 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", checkpoint=None, say=
                 raise KeyboardInterrupt(f"step {training.step} is stored; to continue: "
                                         f"python d3dlo.py train --out {run} --resume")
             if time.monotonic() - stored > STORE_EVERY:
+                final, _ = training.usable()
                 training.store_checkpoint()
-                training.store_weights(training.usable()[0])
+                training.store_weights(final)
                 stored = time.monotonic()
         final, twin = training.usable()
         loss = mean_loss(twin, training.objective, training.examples())
@@ -677,8 +681,10 @@ def predict_refined(net, scans_p, scans_q, refine, device):
 def predict_motions(net, records, device="cpu", batch=16, refine=0):
     """Records of consecutive scans (n,) -> T_{t,t+1} (n-1,4,4), Velodyne frame.
 
-    `refine`: 0 for the paper's plain prediction, otherwise see `predict_refined`.
+    `refine`: 0 for the paper's plain prediction, otherwise see `predict_refined`. ValueError for a
+    negative one.
     """
+    check_number("refine", refine)
     motions = [np.empty((0, 4, 4))]
     for i in range(0, len(records) - 1, batch):
         scans = records[i:i + batch + 1]
@@ -1343,8 +1349,11 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
             say(f"of the training split {' '.join(sorted(missing))} are missing")
         fit(net, geometry, motions, run, seed, device, checkpoint, say, objective, test, **facts)
         if held_out:
-            evaluate(root, run, [s.name for s in held_out], run / "results", device, say=say,
-                     network=network)
+            names = [s.name for s in held_out]
+            try:
+                evaluate(root, run, names, run / "results", device, say=say, network=network)
+            except KeyboardInterrupt:
+                raise KeyboardInterrupt(f"the weights are complete: {run}/weights.pt") from None
         say(f"weights       {run}/weights.pt\n"
             f"next          python d3dlo.py eval --weights {run}{f' --data {data}' * bool(data)}")
     return run
@@ -1379,11 +1388,15 @@ def starting_point(run, resume, weights, config, network, seed):
         net.config = replace(net.config, **{name: getattr(config, name) for name in TRAINING})
         return net, None, state
     torch.manual_seed(seed)
-    return network(config), None, {"train": {}, "before": [], "seen": []}
+    return network(config), None, None
 
 
-def training_facts(fingerprints, motions, geometry, before):
-    """What a weights file keeps about its training data, and about those of the weights before."""
+def training_facts(fingerprints, motions, geometry, before=None):
+    """What a weights file keeps about its training data: fingerprints, mean motion, statistics.
+
+    before: the facts of the weights that training started from, which are kept as well.
+    """
+    before = before or {"train": {}, "before": [], "seen": []}
     stats = [records["stats"] for records in geometry]
     stats = np.concatenate([*stats, np.reshape(before["seen"], (-1, len(kitti.STATS)))])
     return {"train": fingerprints,

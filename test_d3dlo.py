@@ -85,7 +85,7 @@ def a_batch(rng, config=SMALL, pairs=3):
 
 
 def in_double(batch):
-    return batch._replace(xyz=batch.xyz.double(), group=batch.group.double())
+    return batch._replace(xyz=batch.xyz.double(), group_sa1=batch.group_sa1.double())
 
 
 def norms_of(net):
@@ -204,9 +204,9 @@ def test_scan_geometry_is_fps_and_grouping_of_the_usable_points(seed):
     neighbours = usable[group_ball(xyz, picks, 2.0, 4)]
     assert g["broken"] == 4                             # far away is not broken
     assert_array_equal(g["xyz"], xyz[picks])
-    assert_array_equal(g["group"], np.concatenate([neighbours[..., 3:], neighbours[..., :3] - xyz[picks][:, None]], -1))
-    assert_array_equal(g["idx2"], group_ball(xyz[picks], np.arange(16), 4.0, 8))
-    assert_array_equal(g["idx3"], group_ball(xyz[picks[:16]], np.arange(8), 8.0, 4))
+    assert_array_equal(g["group_sa1"], np.concatenate([neighbours[..., 3:], neighbours[..., :3] - xyz[picks][:, None]], -1))
+    assert_array_equal(g["idx_sa2"], group_ball(xyz[picks], np.arange(16), 4.0, 8))
+    assert_array_equal(g["idx_sa3"], group_ball(xyz[picks[:16]], np.arange(8), 8.0, 4))
     fullest = max(((xyz[:, 2] >= z) & (xyz[:, 2] < z + 0.3)).sum() for z in np.arange(-10, 10) * 0.3)
     assert_allclose(g["stats"], [200, usable[:, 3].mean(), np.median(np.sqrt(np.square(g["xyz"]).sum(1))), fullest / 200], rtol=0.02)
 
@@ -335,12 +335,12 @@ def by_the_equations(net, b):
                                           for j, near in enumerate(idx)])
     out = []
     for p, q in zip(b.p, b.q):
-        f, g = (torch.stack([torch.stack([h(net.sa1.mpn, point) for point in ball]).max(0).values for ball in b.group[c]]) for c in (p, q))
+        f, g = (torch.stack([torch.stack([h(net.sa1.mpn, point) for point in ball]).max(0).values for ball in b.group_sa1[c]]) for c in (p, q))
         x, y = b.xyz[p], b.xyz[q]
         nearest = torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist").topk(net.config.fe.n_n, largest=False).indices
         e = torch.stack([torch.stack([h(net.fe.mpn, f[i], g[j], y[j] - x[i]) for j in near]).max(0).values for i, near in enumerate(nearest)])
-        x, e = eq_3(net.sa2, x, e, b.idx2[p])
-        x, e = eq_3(net.sa3, x, e, b.idx3[p])
+        x, e = eq_3(net.sa2, x, e, b.idx_sa2[p])
+        x, e = eq_3(net.sa3, x, e, b.idx_sa3[p])
         out.append(net.mlp(torch.stack([h(net.mpn, e_i) for e_i in e]).max(0).values[None])[0])
     return torch.stack(out)
 
@@ -474,18 +474,18 @@ def test_augmented_pairs_still_fit_their_motion(seed):
     rng = generator(seed)
     geometry, motions = pairs_of_scans(rng, 6, points=200, config=SMALL)
     for p, q in geometry:  # Q is P moved: the same points in the same order
-        assert_array_equal(p["idx2"], q["idx2"])
+        assert_array_equal(p["idx_sa2"], q["idx_sa2"])
     before, T = np.stack([g[d] for d in (0, 1) for g in geometry]), np.concatenate(motions)
     clouds, T_new = d3dlo.augment(before, T, rng)
     for p, q, old, X, Y in zip(clouds[:6], clouds[6:], before[:6], T_new, T):
         assert_allclose(move(X, q["xyz"]), p["xyz"], atol=1e-4)
-        near_p, near_q = (c["xyz"][:, None] + c["group"][..., 1:] for c in (p, q))
+        near_p, near_q = (c["xyz"][:, None] + c["group_sa1"][..., 1:] for c in (p, q))
         assert_allclose(move(X, near_q), near_p, atol=1e-4)
         assert np.linalg.det(X[:3, :3]) > 0.999  # no reflection is left
         assert np.abs(X - Y).max() > 1e-3  # something moved
         left_to_right = np.sign(p["xyz"][0, 1] * old["xyz"][0, 1])
         assert_array_equal(p["xyz"] * [1, left_to_right, 1], old["xyz"])
-    before["xyz"], before["group"][..., 1:] = clouds["xyz"], clouds["group"][..., 1:]
+    before["xyz"], before["group_sa1"][..., 1:] = clouds["xyz"], clouds["group_sa1"][..., 1:]
     assert before.tobytes() == clouds.tobytes()         # nothing else has changed
 
 
@@ -2116,7 +2116,7 @@ def test_two_scales_group_both_balls_as_group_ball_does(seed, N):
         offsets = xyz[idx] - xyz[centroids][:, None]
         return torch.from_numpy(np.concatenate([scan[idx, 3:], offsets], -1))
     expected = torch.cat([mpn.small(features(1.0, 3)), mpn.large(features(2.0, 12))], -1)
-    group = torch.from_numpy(scan_geometry(scan, TWO_BALLS)["group"])
+    group = torch.from_numpy(scan_geometry(scan, TWO_BALLS)["group_sa1"])
     torch.testing.assert_close(mpn(group[None])[0], expected, rtol=1e-5, atol=1e-5)
     assert expected.shape == (32, 2 * 16)
 

@@ -306,9 +306,9 @@ def seconds_a_step(variant, config):
     rng = np.random.default_rng(0)
     records = np.zeros(config.batch + 1, d3dlo.geometry_dtype(config))
     records["xyz"] = rng.normal(size=records["xyz"].shape) * 20
-    records["group"] = rng.normal(size=records["group"].shape)
-    records["idx2"] = rng.integers(config.sa1.n_fps, size=records["idx2"].shape)
-    records["idx3"] = rng.integers(config.sa2.n_fps, size=records["idx3"].shape)
+    records["group_sa1"] = rng.normal(size=records["group_sa1"].shape)
+    records["idx_sa2"] = rng.integers(config.sa1.n_fps, size=records["idx_sa2"].shape)
+    records["idx_sa3"] = rng.integers(config.sa2.n_fps, size=records["idx_sa3"].shape)
     motions = np.tile(np.eye(4), (config.batch, 1, 1))
     pairs = [(0, i) for i in range(config.batch)]
     training = d3dlo.Training(variant.network(config), [records], [motions], "",

@@ -207,7 +207,7 @@ def make_readers(folder, rng):
     readers = {
         "scan": ("000000.bin", kitti.read_scan, lambda scan: scan.shape[1:] == (4,)),
         "geometry": ("000000.bin", read_record, lambda record: (
-            finite(record["xyz"], 32, 3) and finite(record["group"], 32, 4, 4))),
+            finite(record["xyz"], 32, 3) and finite(record["group_sa1"], 32, 4, 4))),
         "poses": ("poses.txt", metrics.read_poses, lambda T: finite(T, None, 4, 4)),
         "calibration": ("calib.txt", kitti.read_calib, lambda T: finite(T, 4, 4)),
         "weights": ("weights.pt", d3dlo.load_weights, sound_weights),

@@ -78,10 +78,10 @@ def method(root, name, i):
     scatter(whole, scan, 0.3, "0.6")
     scatter(whole, xyz, 4, "black")
     window(whole, (0, 0), 45, f"a scan, its {len(xyz):,} centroids")
-    neighbours = xyz[j] + p["group"][j][:, 1:]  # group holds intensity and x_i - x'_j
+    neighbours = xyz[j] + p["group_sa1"][j][:, 1:]  # group holds intensity and x_i - x'_j
     draw_ball(ball1, scan, neighbours, xyz[j], sa1.r,
               f"SA1: {sa1.n_n} of the points within {sa1.r:.0f} m")
-    draw_ball(ball2, xyz, xyz[p["idx2"][j]], xyz[j], sa2.r,
+    draw_ball(ball2, xyz, xyz[p["idx_sa2"][j]], xyz[j], sa2.r,
               f"SA2: centroids within {sa2.r:.0f} m")
     draw_flow(flow, xyz, q["xyz"], xyz[j], config.fe.n_n)
     return figure
