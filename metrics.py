@@ -398,6 +398,13 @@ def _pairs_of_files(gt, est):
     return pairs
 
 
+def _check_picture(png, pairs):
+    """ValueError when a picture would replace one of the pose files."""
+    inputs = [path for pair in pairs.values() for path in pair]
+    if png.exists() and any(path.exists() and png.samefile(path) for path in inputs):
+        raise ValueError(f"--plot {png}: is one of the input files; choose another name")
+
+
 def _read_pair(gt, est):
     """True and estimated poses (n,4,4) from two pose files. ValueError when the numbers differ."""
     T_gt, T_est = read_poses(gt), read_poses(est)
@@ -438,6 +445,8 @@ def main(argv=None):
     args = parser.parse_args(argv)
     try:
         pairs = _pairs_of_files(args.gt, args.est)
+        if args.plot:
+            _check_picture(args.plot, pairs)
         trajectories = {name: _read_pair(gt, est) for name, (gt, est) in pairs.items()}
         if args.plot:
             draw(args.plot, trajectories)
