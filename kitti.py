@@ -1,15 +1,36 @@
-"""The data: KITTI odometry scans, calibration, frames, splits, the ground plane, and a simulated city for when there is no KITTI.
+"""The data: KITTI odometry scans, calibration, frames, splits, ground plane, simulated city.
 
-A scan is an (N,4) float32 array x, y, z [m], intensity [0..1] in the Velodyne frame: x forward, y left, z up. `T_ab` maps points from
-frame b to frame a. Pose files are in KITTI's rectified left camera frame; everything this module hands out as `poses` or `motions()` is
-in the Velodyne frame, because that is what the points are in: T_velo = inv(Tr) @ T_cam @ Tr. Needs NumPy and SciPy.
+A scan is an array (N,4) float32: x, y, z [m] in the Velodyne frame (x forward, y left, z up) and
+intensity [0..1]. `T_ab` maps points from frame b to frame a.
 
-    python kitti.py simulate data/city      # an HDL-64E drives through 11 little cities, with exact ground truth: 2,620 scans, 4.2 GB
+KITTI's pose files are in the frame of the rectified left camera. The points are in the Velodyne
+frame, so `poses` and `motions()` of a sequence are, too: T_velo = inv(Tr) @ T_cam @ Tr.
+
+The simulated city replaces KITTI where it is not at hand: an HDL-64E drives through 11 small cities
+with exact ground truth, 2,620 scans or 4.2 GB. Needs NumPy and SciPy.
+
+    python kitti.py simulate data/city
     python kitti.py simulate data/tiny --sequences 00 07 --scans 40 --azimuth 900
-    python kitti.py raw DRIVE data/raw      # a drive of KITTI's raw data, with ground truth
+    python kitti.py raw DRIVE data/raw      # convert a drive of KITTI's raw data
 """
-import argparse, ctypes, functools, hashlib, importlib.metadata, itertools, json, os, platform, re, shutil, signal, subprocess, sys
-import threading, time, warnings, zlib
+import argparse
+import ctypes
+import functools
+import hashlib
+import importlib.metadata
+import itertools
+import json
+import os
+import platform
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+import warnings
+import zlib
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
@@ -25,16 +46,23 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-SPLITS = {"train": ("00", "01", "02", "08", "09"), "test": ("03", "04", "05", "06", "10"), "validation": ("07",)}  # paper, section 4
+# Section 4 of the paper
+SPLITS = {
+    "train": ("00", "01", "02", "08", "09"),
+    "test": ("03", "04", "05", "06", "10"),
+    "validation": ("07",),
+}
 
+# ------------------------------------------------------------------------------------------------
+# Files
 
-# ---------------------------------------------------------------------------------------------------------------- files
-
-FIVE_FLOATS = ("If it is nuScenes', with five floats per point, convert each file with "
+FIVE_FLOATS = ("nuScenes files have five floats per point: convert each with "
                "np.save(NEW, np.fromfile(OLD, np.float32).reshape(-1, 5)[:, :4])")
+OTHER_FORMATS = b"\x93NUMPY", b"ply\n", b"ply\r", b"# .PCD"  # how files of other formats begin
 
 
 def _check_scan_size(path, size):
+    """ValueError unless a .bin file of `size` bytes can hold a scan."""
     if size == 0 or size % 16:
         raise ValueError(f"{path} has {size} bytes, but a scan has 16 (four float32) per point: "
                          f"copy or unpack it again. {FIVE_FLOATS}.")
@@ -55,22 +83,26 @@ def read_scan(path: str | Path, intensity_max: float = 1) -> np.ndarray:
 
 
 def _read_bin(path):
+    """A .bin file -> scan (N,4) float32."""
     data = path.read_bytes()
-    if data.startswith((b"\x93NUMPY", b"ply\n", b"ply\r", b"# .PCD")):
-        raise ValueError(f"{path} is no KITTI scan but another format: read it with its own library and hand over x, y, z, intensity.")
+    if data.startswith(OTHER_FORMATS):
+        raise ValueError(f"{path} is not a KITTI scan but a file of another format: read it with "
+                         "its own library and save x, y, z, intensity as .npy.")
     _check_scan_size(path, len(data))
-    return np.frombuffer(data, "<f4").reshape(-1, 4).astype(np.float32)  # (N,4), a copy that may be written to
+    return np.frombuffer(data, "<f4").reshape(-1, 4).astype(np.float32)  # (N,4), a writable copy
 
 
 def _read_npy(path):
+    """A .npy file -> scan (N,4) float32."""
     try:
         points = np.load(path, allow_pickle=False)
     except OSError:
         raise
     except Exception:  # np.load raises many exception types; all of them mean a corrupt file
         raise ValueError(f"{path} is no NumPy file or is damaged: save the scan again.") from None
-    shape = getattr(points, "shape", ())  # an archive of several arrays has none
-    if len(shape) != 2 or shape[0] == 0 or shape[1] not in (3, 4) or points.dtype.kind not in "fiu":
+    shape = getattr(points, "shape", ())  # an archive of several arrays has no shape
+    if (len(shape) != 2 or shape[0] == 0 or shape[1] not in (3, 4)
+            or points.dtype.kind not in "fiu"):
         raise ValueError(f"{path} has shape {shape}, but a scan is an array of numbers (N,3) or "
                          "(N,4): save the columns x, y, z and intensity.")
     scan = np.zeros((len(points), 4), np.float32)
@@ -80,20 +112,26 @@ def _read_npy(path):
 
 
 def read_calib(path: str | Path) -> np.ndarray:
-    """calib.txt of a sequence -> T_cam0_velo (4,4) float64, its row `Tr`: Velodyne points to the rectified left camera [m].
-    Raises FileNotFoundError; ValueError when `Tr` is missing, is not 12 finite numbers or does not hold a rotation."""
+    """Read the row `Tr` of a sequence's calib.txt.
+
+    Returns T_cam0_velo (4,4) float64, which maps points from the Velodyne frame to the frame of the
+    rectified left camera [m]. Raises FileNotFoundError, and ValueError when `Tr` is missing or is
+    not 12 finite numbers with a rotation.
+    """
     path = Path(path)
-    get = "KITTI's is in data_odometry_calib.zip; for drives of your own write the line Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0"
+    remedy = ("KITTI's is in data_odometry_calib.zip; for drives of your own write the line "
+              "Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0")
     if not path.is_file():
-        raise FileNotFoundError(f"{path} does not exist: {get}.")
+        raise FileNotFoundError(f"{path} does not exist: {remedy}.")
     row = _calib_row(path, "Tr", 12).reshape(3, 4)
     if not _is_rigid(row):
-        raise ValueError(f"{path} has no row 'Tr' (Velodyne to camera) of 12 finite numbers, a rotation and a translation: {get}.")
+        raise ValueError(f"{path} has no row 'Tr' (Velodyne to camera) of 12 finite numbers, a "
+                         f"rotation and a translation: {remedy}.")
     return np.vstack([row, [0, 0, 0, 1]])  # (4,4)
 
 
 def _calib_row(path, name, count):
-    """Row `name` of a calibration file: (count,) numbers, all NaN when there is no such row."""
+    """The numbers (count,) of row `name` in a calibration file, NaN if there is no such row."""
     rows = re.findall(rb"^\s*%s\s*:(.*)$" % name.encode(), path.read_bytes(), re.M)
     try:
         return np.array(rows[0].split(), dtype=float).reshape(count)
@@ -104,53 +142,72 @@ def _calib_row(path, name, count):
 def _is_rigid(row):
     """Whether (3,4) is finite, with a rotation in its first three columns."""
     R = row[:, :3]
-    with np.errstate(all="ignore"):  # absurd numbers overflow
-        rotation = np.abs(R @ R.T - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0
+    with np.errstate(all="ignore"):  # huge numbers overflow
+        deviation = np.abs(R @ R.T - np.eye(3)).max()
+        rotation = deviation < 1e-3 and np.linalg.det(R) > 0
     return bool(np.isfinite(row).all() and rotation)
-
-
-# --------------------------------------------------------------------------------------------------------------- frames
-
-def invert(T):
-    """The inverse of rigid transforms (...,4,4): [R t]^-1 = [R^T, -R^T t]. Cheaper and cleaner than a general inverse."""
-    T = np.asarray(T, dtype=float)
-    R = np.swapaxes(T[..., :3, :3], -1, -2)
-    out = np.zeros_like(T)
-    out[..., :3, :3], out[..., :3, 3:], out[..., 3, 3] = R, -R @ T[..., :3, 3:], 1
-    return out
 
 
 def write_tum(path: str | Path, T: np.ndarray, times: np.ndarray) -> None:
     """Write poses (n,4,4) at `times` (n,) [s] as a TUM trajectory file, through a temporary file.
 
-    A row is t x y z qx qy qz qw, with qw >= 0, in the frame of the poses."""
+    A row is t x y z qx qy qz qw, with qw >= 0, in the frame of the poses. Raises ValueError when
+    the numbers of poses and times differ, and OSError.
+    """
     q = Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True)  # (n,4)
     with replacing(path) as temporary, open(temporary, "w", newline="\n") as file:
         np.savetxt(file, np.c_[times, T[:, :3, 3], q], fmt="%.9f")
 
 
+# ------------------------------------------------------------------------------------------------
+# Frames
+
+
+def invert(T):
+    """The inverses of rigid transforms (...,4,4): R^T and -R^T t for R and t.
+
+    Faster and more accurate than a general matrix inverse.
+    """
+    T = np.asarray(T, dtype=float)
+    R_inverse = np.swapaxes(T[..., :3, :3], -1, -2)
+    out = np.zeros_like(T)
+    out[..., :3, :3] = R_inverse
+    out[..., :3, 3:] = -R_inverse @ T[..., :3, 3:]
+    out[..., 3, 3] = 1
+    return out
+
+
 def camera_to_velo(T_cam, Tr):
-    """Poses or motions (...,4,4) of the camera -> those of the Velodyne, inv(Tr) @ T @ Tr."""
+    """Camera poses or motions (...,4,4) -> those of the Velodyne, inv(Tr) @ T_cam @ Tr."""
     return invert(Tr) @ T_cam @ Tr
 
 
 def velo_to_camera(T_velo, Tr):
-    """Poses or motions (...,4,4) of the Velodyne -> those of the rectified left camera, Tr @ T @ inv(Tr)."""
+    """Velodyne poses or motions (...,4,4) -> those of the camera, Tr @ T_velo @ inv(Tr)."""
     return Tr @ T_velo @ invert(Tr)
 
 
 def to_vector(T: np.ndarray) -> np.ndarray:
-    """Rigid transforms (...,4,4) -> (...,6) float64: [tx, ty, tz] m, [roll, pitch, yaw] degrees, extrinsic x-y-z (paper 3.2)."""
+    """Rigid transforms as vectors, section 3.2 of the paper.
+
+    T (...,4,4) -> (...,6) float64: tx, ty, tz [m]; roll, pitch, yaw [degrees], the Euler angles
+    about the fixed axes x, y, z in that order.
+    """
     T = np.asarray(T, dtype=float)
     flat = T.reshape(-1, 4, 4)
-    with warnings.catch_warnings():  # gimbal lock (pitch +-90 degrees): scipy sets the third angle to zero, still the same rotation
-        warnings.simplefilter("ignore", UserWarning)
-        angles = Rotation.from_matrix(flat[:, :3, :3]).as_euler("xyz", degrees=True) if len(flat) else np.empty((0, 3))
-    return np.concatenate([flat[:, :3, 3], angles], axis=1).reshape(T.shape[:-2] + (6,))
+    angles = np.empty((0, 3))
+    if len(flat):
+        with warnings.catch_warnings():
+            # At a pitch of +-90 degrees (gimbal lock), scipy warns and sets the third angle to
+            # zero. The rotation is still the same.
+            warnings.simplefilter("ignore", UserWarning)
+            angles = Rotation.from_matrix(flat[:, :3, :3]).as_euler("xyz", degrees=True)
+    vectors = np.concatenate([flat[:, :3, 3], angles], axis=1)
+    return vectors.reshape(T.shape[:-2] + (6,))
 
 
 def from_vector(v: np.ndarray) -> np.ndarray:
-    """The inverse of `to_vector`: (...,6) metres and degrees -> (...,4,4) float64."""
+    """The inverse of `to_vector`: (...,6) in metres and degrees -> (...,4,4) float64."""
     v = np.asarray(v, dtype=float)
     flat = v.reshape(-1, 6)
     T = np.tile(np.eye(4), (len(flat), 1, 1))
@@ -160,36 +217,49 @@ def from_vector(v: np.ndarray) -> np.ndarray:
     return T.reshape(v.shape[:-1] + (4, 4))
 
 
-# ------------------------------------------------------------------------------------------------------------ sequences
+# ------------------------------------------------------------------------------------------------
+# Sequences
+
 
 class Sequence:
-    """One sequence of ROOT in KITTI's layout, checked before anything is used: ROOT/sequences/NAME/{velodyne/000000.bin ..., calib.txt}
-    and, where there is ground truth, ROOT/poses/NAME.txt.
+    """A sequence of ROOT in KITTI's layout. All its files are checked when it is opened.
 
-    name, scan_paths (list of n paths), Tr (4,4) = T_cam0_velo, poses_cam (n,4,4) as in the file or None, poses (n,4,4) = T_0t in the
-    Velodyne frame or None. Raises FileNotFoundError or ValueError when anything is missing or does not fit together."""
-    intensity_max = 1  # of the files; KITTI's intensities are within 0..1
+    The files are ROOT/sequences/NAME/velodyne/000000.bin ..., ROOT/sequences/NAME/calib.txt and,
+    where there is ground truth, ROOT/poses/NAME.txt.
+
+    name, folder: its name and ROOT/sequences/NAME; scan_paths: list of n paths; Tr (4,4):
+    T_cam0_velo; poses_cam (n,4,4): the poses as in the file; poses (n,4,4): T_0t in the Velodyne
+    frame. Both are None without ground truth. Raises FileNotFoundError for a missing file, and
+    ValueError for a damaged one or when the numbers of scans and poses differ.
+    """
+
+    intensity_max = 1  # intensities are divided by this; KITTI's are within 0..1
 
     def __init__(self, root, name):
-        self.name, self.folder = name, Path(root) / "sequences" / name
+        self.name = name
+        self.folder = Path(root) / "sequences" / name
         velodyne = self.folder / "velodyne"
         self.scan_paths = sorted(velodyne.glob("*.bin"))
         if not self.scan_paths:
-            raise FileNotFoundError(f"{velodyne} holds no scans: unpack data_odometry_velodyne.zip over it, other archives have none.")
+            raise FileNotFoundError(f"{velodyne} holds no scans: unpack data_odometry_velodyne.zip "
+                                    "over it, other archives have none.")
         for i, path in enumerate(self.scan_paths):
             if path.name != f"{i:06d}.bin":
-                raise ValueError(f"{velodyne} should hold {i:06d}.bin next but holds {path.name}: scans are numbered from 000000 without "
-                                 "a gap, unpack data_odometry_velodyne.zip again.")
-            _check_scan_size(path, os.stat(path).st_size)
+                raise ValueError(f"{velodyne} should hold {i:06d}.bin next but holds {path.name}: "
+                                 "scans are numbered from 000000 without a gap, unpack "
+                                 "data_odometry_velodyne.zip again.")
+            _check_scan_size(path, path.stat().st_size)
         self.Tr = read_calib(self.folder / "calib.txt")
+
         self.poses_cam = self.poses = None
         truth = Path(root) / "poses" / f"{name}.txt"
         if truth.exists():
             self.poses_cam = read_poses(truth)  # (n,4,4)
             if len(self.poses_cam) != len(self):
-                raise ValueError(f"{truth} has {len(self.poses_cam)} poses but {velodyne} has {len(self)} scans: "
-                                 "the two must agree, unpack whichever is incomplete again.")
-            self.poses = camera_to_velo(self.poses_cam, self.Tr)
+                raise ValueError(f"{truth} has {len(self.poses_cam)} poses but {velodyne} has "
+                                 f"{len(self)} scans: the two must agree, unpack whichever is "
+                                 "incomplete again.")
+            self.poses = camera_to_velo(self.poses_cam, self.Tr)  # (n,4,4)
 
     def __len__(self):
         return len(self.scan_paths)
@@ -199,12 +269,15 @@ class Sequence:
         return read_scan(self.scan_paths[i], self.intensity_max)
 
     def motions(self) -> np.ndarray:
-        """(n-1,4,4) T_{t,t+1} = inv(T_t) @ T_{t+1} (paper eq. 1) in the Velodyne frame: maps points of scan t+1 into scan t.
-        Raises ValueError when the sequence has no ground truth."""
+        """True motions T_{t,t+1} = inv(T_t) @ T_{t+1} (n-1,4,4), eq. 1 of the paper.
+
+        They are in the Velodyne frame and map points of scan t+1 to the frame of scan t. Raises
+        ValueError when the sequence has no ground truth.
+        """
         if self.poses is None:
             raise ValueError(f"Sequence {self.name} has no ground truth: put it into ROOT/poses/"
                              f"{self.name}.txt beside ROOT/sequences (SemanticKITTI's sequences/"
-                             f"{self.name}/poses.txt is no truth, SuMa estimated it).")
+                             f"{self.name}/poses.txt is not ground truth: SuMa estimated it).")
         return invert(self.poses[:-1]) @ self.poses[1:]
 
 
@@ -227,29 +300,37 @@ class ScanFolder(Sequence):
         for path in self.scan_paths:
             if path.suffix == ".bin":
                 _check_scan_size(path, path.stat().st_size)
+
+        self.notes = []
         largest = _largest_intensity(self.scan_paths)
         self.intensity_max = 255 if largest > 1 else 1
-        self.times, self.notes = 0.1 * np.arange(len(self)), []
         if largest == 0:
             self.notes.append("there are no intensities; zeros are used, so expect larger errors")
         if largest > 1:
             self.notes.append(f"intensities reach {largest:.4g}; all are divided by 255")
+
         if (self.folder / "times.txt").exists():
             self.times = _read_times(self.folder / "times.txt", len(self))
         else:
+            self.times = 0.1 * np.arange(len(self))
             self.notes.append("there is no times.txt, one time in seconds per line; "
                               "10 scans a second are assumed")
 
 
 def scans_in(folder):
     """The *.bin and *.npy files of a folder, in natural order: list of paths."""
+    def with_padded_numbers(path):  # "2.bin" comes before "10.bin"
+        return re.sub(r"\d+", lambda digits: digits[0].zfill(20), path.name)
+
     paths = [path for path in Path(folder).glob("[!.]*") if path.suffix in (".bin", ".npy")]
-    pad = lambda digits: digits[0].zfill(20)
-    return sorted(paths, key=lambda path: re.sub(r"\d+", pad, path.name))
+    return sorted(paths, key=with_padded_numbers)
 
 
 def _largest_intensity(paths):
-    """The largest intensity of ten scans spread over a folder; ValueError if it cannot be one."""
+    """The largest intensity in ten scans spread over a folder.
+
+    ValueError for one below 0 or above 255, which cannot be an intensity.
+    """
     largest = 0
     for i in np.unique(np.linspace(0, len(paths) - 1, 10).astype(int)):
         intensity = read_scan(paths[i])[:, 3]
@@ -266,7 +347,7 @@ def _largest_intensity(paths):
 
 
 def _read_times(path, n):
-    """(n,) seconds, one per line and increasing; ValueError when the file holds anything else."""
+    """The times (n,) [s] in a times.txt, one per line. ValueError unless they increase."""
     try:
         times = np.array(path.read_bytes().split(), dtype=float)
     except ValueError:
@@ -277,39 +358,69 @@ def _read_times(path, n):
     return times
 
 
+def _is_plain_folder(root):
+    """Whether ROOT is a plain folder of scans and not KITTI's odometry layout."""
+    return not (Path(root) / "sequences").exists()
+
+
+def _is_raw_data(root):
+    """Whether ROOT looks like KITTI's raw data, a drive or a folder of drives."""
+    paths = root, *root.glob("*"), *root.glob("*/*")
+    return any(re.search(r"_drive_\d+|^velodyne_points$", path.name) for path in paths)
+
+
 def sequence_names(root: str | Path) -> list[str]:
-    """The sequences of ROOT that have scans; a plain folder of scans is one, with its name.
-    Raises FileNotFoundError when there are none, as in an unknown layout."""
+    """The names of the sequences of ROOT that have scans, sorted.
+
+    A plain folder of scans is one sequence with the folder's name. Raises FileNotFoundError when
+    there are no scans, or none in a known layout.
+    """
     root = Path(root)
-    if not (root / "sequences").exists() and scans_in(root):
+    if _is_plain_folder(root) and scans_in(root):
         return [root.resolve().name]
-    there = sorted(p.parent.name for p in root.glob("sequences/[!.]*/velodyne") if next(p.glob("*.bin"), None))
-    if not there:
-        raw = any(re.search(r"_drive_\d+|^velodyne_points$", p.name) for p in (root, *root.glob("*"), *root.glob("*/*")))
+    folders = root.glob("sequences/[!.]*/velodyne")
+    names = sorted(folder.parent.name for folder in folders if any(folder.glob("*.bin")))
+    if not names:
         remedy = "check the path and unpack its archives"
-        if raw:
+        if _is_raw_data(root):
             remedy = "convert KITTI's raw data with `python kitti.py raw DRIVE ROOT`"
         raise FileNotFoundError(
-            f"{root} has no scans in a known layout: {remedy}. Known are a folder of *.bin or *.npy "
-            "files, and KITTI's odometry layout, ROOT/sequences/00/{velodyne/000000.bin, calib.txt} "
-            "and ROOT/poses/00.txt.")
-    return there
+            f"{root} has no scans in a known layout: {remedy}. Known are a folder of *.bin or "
+            "*.npy files, and KITTI's odometry layout, ROOT/sequences/00/{velodyne/000000.bin, "
+            "calib.txt} and ROOT/poses/00.txt.")
+    return names
 
 
 def open_sequences(root: str | Path, names: str | list[str] | None = None) -> list[Sequence]:
-    """ROOT and names -> list of `Sequence`, in the order given, each once. A name is a folder under ROOT/sequences, a split of SPLITS (as
-    much of it as there is) or 'all'; None is 'all'. A ROOT without sequences/ is one `ScanFolder`.
-    Raises ValueError for an unknown name or a split of which nothing is there, and whatever
-    `sequence_names`, `Sequence` and `ScanFolder` raise."""
+    """Open sequences of ROOT, in the order given, each once.
+
+    names: one or several of the folders under ROOT/sequences, the splits of SPLITS (those of their
+    sequences that ROOT has), or "all"; None means "all". A ROOT without a folder sequences/ is one
+    `ScanFolder`. Raises ValueError for a name that ROOT does not have or a split of which it has
+    nothing, and whatever `sequence_names`, `Sequence` and `ScanFolder` raise.
+    """
     there = sequence_names(root)
-    choices = {split: [n for n in part if n in there] for split, part in SPLITS.items()} | {"all": there} | {n: [n] for n in there}
-    names = ["all"] if names is None else [names] if isinstance(names, str) else list(names)
+    choices = {}
+    for split, members in SPLITS.items():
+        choices[split] = [name for name in members if name in there]
+    choices["all"] = there
+    for name in there:
+        choices[name] = [name]
+
+    if names is None:
+        names = ["all"]
+    elif isinstance(names, str):
+        names = [names]
+    chosen = {}  # a dict keeps the order
     for name in names:
         if not choices.get(name):
-            raise ValueError(f"{root} has no sequence or split {name!r} with scans: there are {' '.join(n for n in choices if choices[n])}.")
-    chosen = dict.fromkeys(n for name in names for n in choices[name])
-    plain = not (Path(root) / "sequences").exists()
-    return [ScanFolder(root) if plain else Sequence(root, n) for n in chosen]
+            known = " ".join(choice for choice, members in choices.items() if members)
+            raise ValueError(f"{root} has no sequence or split {name!r} with scans: choose from "
+                             f"{known}.")
+        chosen |= dict.fromkeys(choices[name])
+    if _is_plain_folder(root):
+        return [ScanFolder(root) for _ in chosen]
+    return [Sequence(root, name) for name in chosen]
 
 
 # ------------------------------------------------------------------------------------------------ from a scan to a cloud
