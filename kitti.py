@@ -422,100 +422,147 @@ def open_sequences(root: str | Path, names: str | list[str] | None = None) -> li
         return [ScanFolder(root) for _ in chosen]
     return [Sequence(root, name) for name in chosen]
 
+# ------------------------------------------------------------------------------------------------
+# From a scan to a point cloud
 
-# ------------------------------------------------------------------------------------------------ from a scan to a cloud
-
-BROKEN_RANGE, BROKEN_INTENSITY = 1000.0, 65536  # m; no LiDAR returns more, so such points are broken
-# Scan statistics, used to warn about domain shift.
-STATS = "usable points", "mean intensity", "median range of the centroids [m]", "share of points in the fullest 0.3 m of height, the ground"
+BROKEN_RANGE, BROKEN_INTENSITY = 1000.0, 65536  # [m]; no LiDAR returns more
+# Scan statistics, used to warn about domain shift
+STATS = ("usable points", "mean intensity", "median range of the centroids [m]",
+         "share of points in the densest 0.3 m of height (the ground)")
 
 
 def usable_points(scan, max_range=None, plane=True):
-    """The points of a scan that the network is given: (N,4) -> (M,4) float32, and how many broken points were dropped.
+    """The points of a scan that the network is given, and the number of broken points.
 
-    Broken points (not finite, or of a range or intensity that no LiDAR returns) go first, then points beyond `max_range` metres
-    (None: none of them), then, unless `plane`, the ground. The order stays. ValueError for another shape than (N,4)."""
+    (N,4) -> (M,4) float32, in the same order. Broken points are dropped first: those that are not
+    finite, or of a range or intensity that no LiDAR returns. Then points beyond `max_range` metres
+    are dropped (None: keep all) and, unless `plane`, the ground. Raises ValueError for another
+    shape than (N,4).
+    """
     with np.errstate(over="ignore", invalid="ignore"):
         scan = np.asarray(scan, np.float32)
         if scan.ndim != 2 or scan.shape[1] != 4:
-            raise ValueError(f"a scan has the shape (N, 4): x, y, z [m] and intensity, not {scan.shape}")
-        x, y, z, intensity = scan.T
-        squared = x * x + y * y + z * z
-        sound = (squared < BROKEN_RANGE ** 2) & (np.abs(intensity) < BROKEN_INTENSITY)  # NaN compares false
-        near = squared < (max_range or BROKEN_RANGE) ** 2
-    kept = scan[sound & near]
-    return kept if plane else remove_plane(kept), np.count_nonzero(~sound)
+            raise ValueError(f"a scan has the shape (N, 4), not {scan.shape}; give x, y, z [m] and "
+                             "intensity of N points")
+        x, y, z, intensity = scan.T  # (N,) each
+        squared_range = x * x + y * y + z * z
+        # A comparison with NaN is false
+        in_range = squared_range < BROKEN_RANGE**2
+        intact = in_range & (np.abs(intensity) < BROKEN_INTENSITY)
+        near = squared_range < (max_range or BROKEN_RANGE) ** 2
+    broken = np.count_nonzero(~intact)
+    kept = scan[intact & near]  # (M,4)
+    if not plane:
+        kept = remove_plane(kept)
+    return kept, broken
 
 
 def scan_stats(scan, centroids):
-    """The usable points of a scan (M,4) and the centroids sampled from them (S,3) -> (4,) STATS."""
-    layer = np.floor(np.clip(scan[:, 2], -100, 100) / 0.3).astype(int)
-    ground = np.bincount(layer - layer.min()).max() / len(scan)
-    return np.array([len(scan), scan[:, 3].mean(dtype=float), np.median(np.linalg.norm(centroids, axis=1)), ground])
+    """Usable points (M,4) and the centroids sampled from them (S,3) -> STATS (4,) of the scan."""
+    height = np.clip(scan[:, 2], -100, 100)
+    layer = np.floor(height / 0.3).astype(int)  # (M,)
+    points_in_layer = np.bincount(layer - layer.min())
+    ground_share = points_in_layer.max() / len(scan)
+    centroid_range = np.linalg.norm(centroids, axis=1)  # (S,)
+    mean_intensity = scan[:, 3].mean(dtype=float)
+    return np.array([len(scan), mean_intensity, np.median(centroid_range), ground_share])
 
 
 def domain_shift(stats, seen):
-    """Which STATS (4,) lie outside the range seen in training (2,4), by more than a factor of 1.5 -> a text, empty if none."""
-    return "; ".join(f"{name} {x:.3g} (in training {low:.3g} to {high:.3g})" for name, x, low, high in zip(STATS, stats, *seen)
-                     if not low / 1.5 <= x <= high * 1.5)
+    """Which statistics of a scan lie outside the range seen in training, by a factor of 1.5.
+
+    stats: STATS (4,); seen (2,4): their least and largest values in training. Returns a text that
+    names them, empty if there are none.
+    """
+    shifts = []
+    for name, x, low, high in zip(STATS, stats, *seen):
+        if not low / 1.5 <= x <= high * 1.5:
+            shifts.append(f"{name} {x:.3g} (in training {low:.3g} to {high:.3g})")
+    return "; ".join(shifts)
 
 
+def remove_plane(scan: np.ndarray, threshold=0.15, max_tilt=15.0, hypotheses=400, subsample=4000,
+                 seed=0) -> np.ndarray:
+    """Remove the ground plane from a scan by RANSAC, section 4 of the paper.
 
-def remove_plane(scan: np.ndarray, threshold=0.15, max_tilt=15.0, hypotheses=400, subsample=4000, seed=0) -> np.ndarray:
-    """A scan (N,3+) -> the scan without the points nearer than `threshold` [m] to its dominant near-horizontal plane (RANSAC; paper 4).
-
-    Planes through three random points whose normal is within `max_tilt` degrees of vertical are scored all at once on a random subsample;
-    the best is fitted again, twice, to all its inliers. Order and non-finite points are kept; unchanged when no plane qualifies."""
+    (N,3) or more columns -> the points that are `threshold` metres or more away from the dominant
+    plane whose normal is within `max_tilt` degrees of vertical. `hypotheses` planes through three
+    random points are scored on `subsample` random points; the best is fitted twice to all its
+    inliers. Order and non-finite points are kept. The scan is unchanged when no plane qualifies.
+    """
     rng = np.random.default_rng(seed)
     xyz = np.ascontiguousarray(scan[:, :3], dtype=np.float32)  # (N,3)
-    good = np.flatnonzero(np.isfinite(xyz).all(axis=1))
-    if len(good) < 3:
+    finite = np.flatnonzero(np.isfinite(xyz).all(axis=1))
+    if len(finite) < 3:
         return scan
-    a, b, c = xyz[good[rng.integers(len(good), size=(3, hypotheses))]].astype(float)  # (H,3) each
+    min_cosine = np.cos(np.radians(max_tilt))
+
+    # Hypotheses: planes normal . x = offset through three random points a, b, c
+    triples = finite[rng.integers(len(finite), size=(3, hypotheses))]
+    a, b, c = xyz[triples].astype(float)  # (H,3) each
     normal = np.cross(b - a, c - a)  # (H,3)
     length = np.linalg.norm(normal, axis=1)
-    upright = np.abs(normal[:, 2]) > np.cos(np.radians(max_tilt)) * np.maximum(length, 1e-9)
+    upright = np.abs(normal[:, 2]) > min_cosine * np.maximum(length, 1e-9)
     if not upright.any():
         return scan
     normal = normal[upright] / length[upright, None]
-    offset = (normal * a[upright]).sum(axis=1)  # a plane is normal . x = offset
-    sample = xyz[good[rng.integers(len(good), size=min(subsample, len(good)))]]  # (M,3)
-    distance = np.abs(normal.astype(np.float32) @ sample.T - offset[:, None].astype(np.float32))  # (H,M)
+    offset = (normal * a[upright]).sum(axis=1)  # (H,)
+
+    # Score them by the number of inliers among M random points
+    sample = xyz[finite[rng.integers(len(finite), size=min(subsample, len(finite)))]]  # (M,3)
+    projected = normal.astype(np.float32) @ sample.T  # (H,M)
+    distance = np.abs(projected - offset[:, None].astype(np.float32))  # (H,M)
     best = (distance < threshold).sum(axis=1).argmax()
     n, d = normal[best], offset[best]
 
-    def near(n, d):
-        with np.errstate(invalid="ignore", over="ignore"):  # NaN compares false, so it is never near
-            return np.abs(xyz @ n.astype(np.float32) - np.float32(d)) < threshold  # (N,)
+    def inliers(n, d):  # (N,) bool
+        with np.errstate(invalid="ignore", over="ignore"):  # NaN is never an inlier
+            return np.abs(xyz @ n.astype(np.float32) - np.float32(d)) < threshold
+
+    # Least squares: the normal is the direction in which the inliers vary least
     for _ in range(2):
-        inlier = xyz[near(n, d)]
-        if len(inlier) < 3:
+        points = xyz[inliers(n, d)]
+        if len(points) < 3:
             return scan
-        mean = inlier.mean(axis=0, dtype=float)
-        centred = inlier - mean.astype(np.float32)
-        n = np.linalg.eigh((centred.T @ centred).astype(float))[1][:, 0]  # least squares: the direction of least spread
+        mean = points.mean(axis=0, dtype=float)
+        centred = points - mean.astype(np.float32)
+        covariance = (centred.T @ centred).astype(float)  # (3,3), but for a factor
+        _, directions = np.linalg.eigh(covariance)  # by increasing variance
+        n = directions[:, 0]
         d = n @ mean
-    return scan if abs(n[2]) < np.cos(np.radians(max_tilt)) else scan[~near(n, d)]  # a wall alone is no ground
+    if abs(n[2]) < min_cosine:  # a wall, for example
+        return scan
+    return scan[~inliers(n, d)]
 
 
-# ----------------------------------------------------------------------------------------------------------- long work
+# ------------------------------------------------------------------------------------------------
+# Long work: progress, processes, signals, folders of training runs
+
 
 def progress(items, total, what):
-    """Yields the items while saying on stderr how many of `total` are done, how fast, and how long the rest will take. On a terminal the
-    line is rewritten in place; elsewhere a plain line comes every 10 s, or every tenth of the time so far when that is longer."""
-    tty, began, done = sys.stderr.isatty(), time.monotonic(), 0
-    due = began + (0.2 if tty else 10)  # s, when to say something again
+    """Yield the items, and say on stderr how many of `total` are done, how fast, and what is left.
+
+    On a terminal the line is rewritten in place. Elsewhere a line is printed every 10 s, or after
+    every tenth of the time so far when that is longer.
+    """
+    tty = sys.stderr.isatty()
+    began, done = time.monotonic(), 0
+    due = began + (0.2 if tty else 10)  # time of the next message [s]
 
     def say(end):
         rate = done / max(time.monotonic() - began, 1e-9)
         minutes, seconds = divmod(round((total - done) / rate), 60)
         line = f"{what}: {done}/{total}, {rate:.3g} /s, {minutes}:{seconds:02d} left"
-        print(f"\r{line:<79}" if tty else line, end=end, file=sys.stderr, flush=True)
+        if tty:
+            line = f"\r{line:<79}"
+        print(line, end=end, file=sys.stderr, flush=True)
+
     try:
-        for done, item in enumerate(items):
-            if done and time.monotonic() > due:
+        for item in items:
+            now = time.monotonic()
+            if done and now > due:
                 say("" if tty else "\n")
-                due = time.monotonic() + (0.2 if tty else max(10, (time.monotonic() - began) / 10))
+                due = now + (0.2 if tty else max(10, (now - began) / 10))
             yield item
             done += 1
     finally:
@@ -524,27 +571,34 @@ def progress(items, total, what):
 
 
 def cores():
-    """Cores this process may use; at most 61, the most worker processes that Windows allows."""
-    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Number of cores this process may use, at most 61: Windows allows no more worker processes."""
+    if hasattr(os, "sched_getaffinity"):
+        count = len(os.sched_getaffinity(0))
+    else:
+        count = os.cpu_count() or 1
     return min(count, 61)
 
 
 def in_processes(function, tasks, workers=None, chunksize=4):
     """Yield function(task) for every task, in order, computed by a pool of worker processes.
 
-    OSError when a worker process died."""
-    pool = ProcessPoolExecutor(workers or cores(), initializer=_worker_starts)
+    workers: number of processes, None for one per core; chunksize: tasks sent to a worker at once.
+    Raises OSError when a worker died.
+    """
+    pool = ProcessPoolExecutor(workers or cores(), initializer=_leave_signals_to_parent)
     try:
         yield from pool.map(function, tasks, chunksize=chunksize)
     except BrokenExecutor:
-        raise OSError("a worker process died. A script needs the line if __name__ == '__main__': before its main part where "
-                      "processes are spawned, as on macOS and Windows; otherwise look for a lack of memory") from None
+        raise OSError("a worker process died. Where processes are spawned, as on macOS and "
+                      "Windows, a script needs the line if __name__ == '__main__': before its main "
+                      "part. Otherwise check the free memory") from None
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def _worker_starts():
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which stops its workers
+def _leave_signals_to_parent():
+    """Let a worker ignore Ctrl-C, which the parent handles, and end at SIGTERM."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
@@ -555,10 +609,11 @@ def terminate_as_interrupted():
 
 
 def keep_freed_memory():
-    """Let glibc keep large freed blocks.
+    """Let glibc keep large freed blocks instead of returning them to the system.
 
-    It would return them to the system and fault them in again at the next allocation, which is a third of the time of a
-    training step on a CPU."""
+    Otherwise every allocation faults its pages in again, a third of the time of a training step on
+    a CPU.
+    """
     try:
         libc = ctypes.CDLL(None)
         libc.mallopt(-4, 0)  # M_MMAP_MAX: large blocks come from the heap too
@@ -568,9 +623,12 @@ def keep_freed_memory():
 
 
 def versions(folder):
-    """Versions of Python and the packages, and the git commit of the code in `folder`, where there is one."""
-    git = shutil.which("git") if (Path(folder) / ".git").exists() else None
-    commit = git and subprocess.run([git, "-C", folder, "describe", "--always", "--dirty"], capture_output=True, text=True).stdout.strip()
+    """Versions of Python and the packages, and the git commit of the code in `folder`, if any."""
+    commit = None
+    git = shutil.which("git")
+    if git and (Path(folder) / ".git").exists():
+        describe = [git, "-C", folder, "describe", "--always", "--dirty"]
+        commit = subprocess.run(describe, capture_output=True, text=True).stdout.strip()
     packages = {name: importlib.metadata.version(name) for name in ("numpy", "scipy", "torch")}
     return {"commit": commit, "python": platform.python_version(), **packages}
 
@@ -586,20 +644,22 @@ def new_name(parent):
 
 @contextmanager
 def run_folder(path):
-    """Make a folder and hold it for one writer: ValueError while another process does. An empty one is removed at the end.
+    """Make a folder and hold it for one writer. If it is new and still empty at the end, remove it.
 
-    The holder locks the file PATH/lock, which nothing else opens; the system unlocks it when the process ends, however it
-    ends. Without fcntl, as on Windows, nothing is locked."""
+    The holder locks the file PATH/lock, which nothing else opens. The system unlocks it when the
+    process ends, in whatever way. Without fcntl, as on Windows, nothing is locked. Raises
+    ValueError while another process holds the folder.
+    """
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     path.mkdir(parents=True, exist_ok=True)
-    lock = open(path / "lock", "a+", encoding="utf-8")
-    with lock:
+    with open(path / "lock", "a+", encoding="utf-8") as lock:
         if fcntl:
             try:
                 fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 lock.seek(0)
-                raise ValueError(f"{path}: another training run writes to it, {lock.read().strip() or 'just started'}; wait for "
+                holder = lock.read().strip() or "just started"
+                raise ValueError(f"{path}: another training run writes to it, {holder}; wait for "
                                  "its end, or choose another folder") from None
         lock.truncate(0)
         lock.write(f"process {os.getpid()} on {platform.node()}\n")
@@ -607,7 +667,7 @@ def run_folder(path):
         try:
             yield
         finally:
-            if made and [p.name for p in path.iterdir()] == ["lock"]:
+            if made and [file.name for file in path.iterdir()] == ["lock"]:
                 (path / "lock").unlink()
                 with suppress(OSError):  # another process has just begun to use it
                     for folder in made:
@@ -616,93 +676,123 @@ def run_folder(path):
 
 @contextmanager
 def delayed_interrupt():
-    """Ctrl-C and SIGTERM wait for the work under way: yields a list that holds the signal once one came.
+    """Delay Ctrl-C and SIGTERM: yield a list to which a signal is added instead of interrupting.
 
-    A second signal interrupts at once. Outside the main thread signals are left alone (Python's rule)."""
-    received, before = [], {}
+    A second signal interrupts at once. Outside the main thread, where Python does not let us handle
+    signals, nothing is delayed.
+    """
+    received, handlers = [], {}
 
     def note(number, frame):
         if received:
             raise KeyboardInterrupt
         received.append(number)
+
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGINT, signal.SIGTERM):
-            before[number] = signal.signal(number, note)
+            handlers[number] = signal.signal(number, note)
     try:
         yield received
     finally:
-        for number, handler in before.items():
+        for number, handler in handlers.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
-# ---------------------------------------------------------------------------------------------------------------- cache
+# ------------------------------------------------------------------------------------------------
+# Cache
+
 
 def cached_records(sequences, compute, dtype, settings, cache="cache"):
     """Compute a record for every scan, once: later calls read the records from files.
 
-    sequences: list of `Sequence`; compute: a function scan (N,4) -> record of `dtype` that can be pickled; settings:
-    whatever else the records depend on. Returns two lists with an entry for each sequence: records (n,), memory-mapped, and
-    the CRC-32 of every scan (n,) uint32, by which `fingerprint` identifies the data.
+    sequences: a list of `Sequence`; compute: a function from a scan (N,4) to a record of `dtype`,
+    which can be pickled; settings: everything else that the records depend on. Returns two lists
+    with an entry for each sequence: records (n,), memory-mapped, and the CRC-32 of every scan (n,)
+    uint32, from which `fingerprint` identifies the data.
 
-    The name of a file is a hash of the settings and of the path, size and times of every scan, so a stale file is never read.
-    Files are moved into place when complete, so two processes may share a cache. A damaged file is made again. Scans are
-    shared out over the cores. ValueError, naming the file, for a scan that `compute` refuses."""
-    stored = np.dtype([("record", dtype), ("scan_crc", "u4"), ("crc", "u4")])
+    A file's name is a hash of the settings and of the path, size and times of every scan, so a
+    stale file is never read. A damaged file is made again. Files are moved into place when they are
+    complete, so two processes may share a cache. All cores share the work. Raises ValueError,
+    naming the file, for a scan that `compute` refuses.
+    """
+    row_dtype = np.dtype([("record", dtype), ("scan_crc", "u4"), ("crc", "u4")])
     files = [Path(cache) / f"{s.name}-{_cache_key(s, settings, dtype)}.npy" for s in sequences]
-    missing = [(s, file) for s, file in zip(sequences, files) if not _is_intact(file, stored, len(s))]
+    missing = [(s, file) for s, file in zip(sequences, files)
+               if not _is_intact(file, row_dtype, len(s))]
     if missing:
-        tasks = [(path, s.intensity_max) for s, _ in missing for path in s.scan_paths]
-        row_of = functools.partial(_cache_row, compute=compute, dtype=stored)
-        with closing(in_processes(row_of, tasks)) as rows:
-            rows = progress(rows, len(tasks), "sampling and grouping, scans")
-            for s, file in missing:
-                header = {"descr": np.lib.format.dtype_to_descr(stored), "fortran_order": False, "shape": (len(s),)}
-                with replacing(file) as temporary, open(temporary, "wb") as out:  # a memory map would crash on a full disk
-                    np.lib.format.write_array_header_1_0(out, header)
-                    for _ in range(len(s)):
-                        out.write(next(rows))
-            next(rows, None)  # lets the progress line end
+        _write_cache(missing, compute, row_dtype)
     loaded = [np.load(file, mmap_mode="r") for file in files]
-    return [rows["record"] for rows in loaded], [np.array(rows["scan_crc"]) for rows in loaded]
+    records = [rows["record"] for rows in loaded]
+    scan_crcs = [np.array(rows["scan_crc"]) for rows in loaded]
+    return records, scan_crcs
+
+
+def _write_cache(missing, compute, row_dtype):
+    """Compute and write the cache files of a list of (sequence, file)."""
+    tasks = [(path, s.intensity_max) for s, _ in missing for path in s.scan_paths]
+    compute_row = functools.partial(_cache_row, compute=compute, row_dtype=row_dtype)
+    with closing(in_processes(compute_row, tasks)) as rows:
+        rows = progress(rows, len(tasks), "sampling and grouping, scans")
+        for s, file in missing:
+            header = {"descr": np.lib.format.dtype_to_descr(row_dtype), "fortran_order": False,
+                      "shape": (len(s),)}
+            # Written row by row: a memory map would crash on a full disk
+            with replacing(file) as temporary, open(temporary, "wb") as out:
+                np.lib.format.write_array_header_1_0(out, header)
+                for _ in range(len(s)):
+                    out.write(next(rows))
+        next(rows, None)  # lets the progress line end
 
 
 def _cache_key(sequence, settings, dtype):
-    """Hash of all that a cache file depends on. The change time (ctime) notices what keeps size and modification time."""
+    """Hash of everything a cache file depends on.
+
+    The ctime of a scan changes even when its size and modification time are kept.
+    """
     stats = [os.stat(path) for path in sequence.scan_paths]
     scans = [(s.st_size, s.st_mtime_ns, s.st_ctime_ns) for s in stats]
     depends = str(sequence.folder.resolve()), scans, sequence.intensity_max, settings, dtype.descr
     return hashlib.sha256(repr(depends).encode()).hexdigest()[:16]
 
 
-def _cache_row(task, compute, dtype):
-    """A scan file and its `intensity_max` -> the bytes of its row in a cache file."""
+def _cache_row(task, compute, row_dtype):
+    """(path of a scan, intensity_max) -> the bytes of its row in a cache file."""
     path, intensity_max = task
-    scan, row = read_scan(path, intensity_max), np.zeros((), dtype)
+    scan = read_scan(path, intensity_max)
+    row = np.zeros((), row_dtype)
     row["scan_crc"] = zlib.crc32(scan)
     try:
         row["record"] = compute(scan)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    row["crc"] = zlib.crc32(row.tobytes()[:-4])
+    row["crc"] = zlib.crc32(row.tobytes()[:-4])  # of the row without its last field, the CRC
     return row.tobytes()
 
 
-def _is_intact(file, dtype, n):
-    """Whether a cache file is there, of this dtype and length, and every checksum in it is right. Says so when it is damaged."""
+def _is_intact(file, row_dtype, n):
+    """Whether a cache file exists, holds n rows and has the right checksums.
+
+    Says so on stderr when the file is damaged.
+    """
     if not file.is_file():
         return False
     try:
-        rows = np.load(file, mmap_mode="r")  # pickles are off, so no code runs
-        if rows.dtype == dtype and all(zlib.crc32(row[:-4]) == crc for row, crc in zip(rows.view(np.uint8).reshape(n, -1), rows["crc"])):
-            return True
+        rows = np.load(file, mmap_mode="r")  # pickles are off by default, so no code runs
+        if rows.dtype == row_dtype:
+            content = rows.view(np.uint8).reshape(n, -1)  # (n,bytes of a row)
+            if all(zlib.crc32(row[:-4]) == crc for row, crc in zip(content, rows["crc"])):
+                return True
     except Exception:  # np.load raises many exception types; all of them mean a corrupt file
         pass
-    print(f"{file}: damaged, it is made again", file=sys.stderr)
+    print(f"{file}: damaged, so it is made again", file=sys.stderr)
     return False
 
 
 def fingerprint(sequence, scan_crcs):
-    """16 hex digits that identify the data of a sequence, wherever they lie: the CRC of every scan, and the poses."""
+    """16 hex digits that identify a sequence by its content: the CRC of every scan, and the poses.
+
+    They do not depend on the folder or on file times.
+    """
     poses = b"" if sequence.poses_cam is None else sequence.poses_cam.tobytes()
     return hashlib.sha256(scan_crcs.tobytes() + poses).hexdigest()[:16]
 
