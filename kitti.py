@@ -422,6 +422,7 @@ def open_sequences(root: str | Path, names: str | list[str] | None = None) -> li
         return [ScanFolder(root) for _ in chosen]
     return [Sequence(root, name) for name in chosen]
 
+
 # ------------------------------------------------------------------------------------------------
 # From a scan to a point cloud
 
@@ -797,12 +798,17 @@ def fingerprint(sequence, scan_crcs):
     return hashlib.sha256(scan_crcs.tobytes() + poses).hexdigest()[:16]
 
 
-# ------------------------------------------------------------------------------ KITTI's raw drives
-# Files and columns: readme.txt of the raw data devkit, and oxts/dataformat.txt of each drive.
-EARTH_RADIUS = 6378137.0  # m, devkit: latlonToMercator.m
-LAT_LON_ALT, ROLL_PITCH_YAW = slice(0, 3), slice(3, 6)  # columns of a packet: degrees, m; radians
-VELOCITY, TURN_RATE = [7, 6, 10], slice(17, 20)  # m/s east, north, up; rad/s around its x, y and z
-NEAR = np.timedelta64(100, "ms")  # without a packet as near as that a scan has no pose
+# ------------------------------------------------------------------------------------------------
+# KITTI's raw drives: readme.txt of the raw data devkit, and oxts/dataformat.txt of each drive
+
+EARTH_RADIUS = 6378137.0  # [m]; devkit: latlonToMercator.m
+# Columns of a GPS/IMU packet
+LAT_LON_ALT = slice(0, 3)  # degrees, degrees, m
+ROLL_PITCH_YAW = slice(3, 6)  # rad
+VELOCITY = [7, 6, 10]  # m/s to the east, to the north and upwards
+TURN_RATE = slice(17, 20)  # rad/s about the unit's x, y and z axes
+MAX_DELAY = np.timedelta64(100, "ms")  # a scan farther from every packet has no pose
+SECOND = np.timedelta64(1, "s")
 
 
 def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int]]:
@@ -816,7 +822,7 @@ def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int
     (number of its first scan in the drive, of its last)}.
 
     A pose is that of the time in velodyne_points/timestamps.txt: the middle of the scanner's turn,
-    when it faces forward and triggers the cameras, which is what the "sync" data is aligned to. The
+    when it faces forward and triggers the cameras. The "sync" data is aligned to this time. The
     GPS/IMU packet of a scan was recorded at another time, 12 to 25 ms later in drive 0013. So the
     nearest packet is moved by its own velocity and turn rate to the time of the scan. The points
     are used as they are: those of a turn were measured over 0.1 s.
@@ -825,31 +831,38 @@ def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int
     one or when ROOT holds such a sequence already. ROOT is then unchanged.
     """
     drive, root = Path(drive), Path(root)
-    name = re.fullmatch(r"((\d{4}_\d\d_\d\d)_drive_\d+)_sync", drive.resolve().name)
-    if not name:
+    match = re.fullmatch(r"((\d{4}_\d\d_\d\d)_drive_\d+)_sync", drive.resolve().name)
+    if not match:
         raise ValueError(f"{drive} is no drive of KITTI's raw data: give a folder such as "
                          "2011_09_26/2011_09_26_drive_0013_sync, of the synced+rectified data.")
-    name, date = name.groups()
-    numbers, scans, times = _raw_stream(drive / "velodyne_points", ".bin", f"{name}_sync.zip")
-    _, packets, packet_times = _raw_stream(drive / "oxts", ".txt", f"{name}_sync.zip")
+    name, date = match.groups()
+    archive = f"{name}_sync.zip"
+    numbers, scans, times = _raw_stream(drive / "velodyne_points", ".bin", archive)
+    _, packets, packet_times = _raw_stream(drive / "oxts", ".txt", archive)
     Tr, T_velo_imu = _raw_calib(drive.resolve().parent, f"{date}_calib.zip")
     for path in scans:
         _check_scan_size(path, path.stat().st_size)
 
-    # the nearest packet of each scan, then the scans in runs without a gap
-    nearest = np.array([np.abs(packet_times - time).argmin() for time in times])
-    late = times - packet_times[nearest]
-    has_pose = np.flatnonzero(np.abs(late) < NEAR)
+    # The nearest packet of each scan
+    nearest = np.array([np.abs(packet_times - t).argmin() for t in times])  # (n,)
+    delay = times - packet_times[nearest]  # (n,)
+    has_pose = np.flatnonzero(np.abs(delay) < MAX_DELAY)
     if not len(has_pose):
         raise ValueError(f"{drive}: no scan was taken within 0.1 s of a GPS/IMU packet; "
-                         f"unpack {name}_sync.zip again.")
-    runs = np.split(has_pose, np.flatnonzero(np.diff(numbers[has_pose]) != 1) + 1)
-    parts = {name if len(runs) == 1 else f"{name}-{i}": run for i, run in enumerate(runs, 1)}
+                         f"unpack {archive} again.")
+
+    # Split the scans at the gaps; each run of consecutive scans becomes a sequence
+    gaps = np.flatnonzero(np.diff(numbers[has_pose]) != 1) + 1
+    runs = np.split(has_pose, gaps)
+    names = [name] if len(runs) == 1 else [f"{name}-{i + 1}" for i in range(len(runs))]
+    parts = dict(zip(names, runs))
+
     packets = np.stack([_read_packet(path) for path in packets])  # (m,30)
-    T_imu = _imu_poses(packets, nearest, late / np.timedelta64(1, "s"))  # (n,4,4)
+    T_imu = _imu_poses(packets, nearest, delay / SECOND)  # (n,4,4)
 
     folders = {part: root / "sequences" / part for part in parts}
-    for path in (*folders.values(), *(root / "poses" / f"{part}.txt" for part in parts)):
+    truths = {part: root / "poses" / f"{part}.txt" for part in parts}
+    for path in (*folders.values(), *truths.values()):
         if path.exists():
             raise ValueError(f"{path} is there already: remove it or choose another ROOT.")
     temporary = {part: temporary_beside(folder) for part, folder in folders.items()}
@@ -857,9 +870,9 @@ def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int
         for part, run in parts.items():
             _write_raw_sequence(temporary[part], [scans[i] for i in run], Tr, times[run])
         for part, run in parts.items():
-            T = invert(T_imu[run[0]]) @ T_imu[run]
+            T = invert(T_imu[run[0]]) @ T_imu[run]  # relative to the first pose
             T_cam = velo_to_camera(T, Tr @ T_velo_imu)  # from the IMU's frame to the camera's
-            write_poses(root / "poses" / f"{part}.txt", T_cam)
+            write_poses(truths[part], T_cam)
             temporary[part].rename(folders[part])
     finally:
         for folder in temporary.values():
@@ -868,8 +881,8 @@ def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int
 
 
 def _write_raw_sequence(folder, scans, Tr, times):
-    """The files of a sequence in odometry layout but its poses."""
-    shutil.rmtree(folder, ignore_errors=True)  # of an earlier process of the same number
+    """Write the scans, calib.txt and times.txt of a sequence in odometry layout."""
+    shutil.rmtree(folder, ignore_errors=True)  # left by an earlier process with the same id
     (folder / "velodyne").mkdir(parents=True)
     for i, scan in enumerate(progress(scans, len(scans), "linking or copying scans")):
         target = folder / "velodyne" / f"{i:06d}.bin"
@@ -877,13 +890,14 @@ def _write_raw_sequence(folder, scans, Tr, times):
             os.link(scan.resolve(), target)
         except OSError:  # another file system, or one without links
             shutil.copyfile(scan, target)
-    seconds = (times - times[0]) / np.timedelta64(1, "s")
-    (folder / "calib.txt").write_text(f"Tr: {' '.join(f'{x:.12e}' for x in Tr[:3].ravel())}\n")
+    row = " ".join(f"{x:.12e}" for x in Tr[:3].ravel())
+    (folder / "calib.txt").write_text(f"Tr: {row}\n")
+    seconds = (times - times[0]) / SECOND
     (folder / "times.txt").write_text("".join(f"{t:.6f}\n" for t in seconds))
 
 
-def _require(path, archive):
-    """Raises FileNotFoundError when a file of KITTI's is missing."""
+def _require_file(path, archive):
+    """FileNotFoundError, naming the archive it is in, when one of KITTI's files is missing."""
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: it is in {archive}.")
 
@@ -896,8 +910,8 @@ def _raw_stream(folder, suffix, archive):
     """
     stamps = folder / "timestamps.txt"
     paths = sorted(path for path in folder.glob(f"data/*{suffix}") if path.stem.isdecimal())
-    _require(stamps, archive)
-    _require(paths[0] if paths else folder / "data" / f"0000000000{suffix}", archive)
+    _require_file(stamps, archive)
+    _require_file(paths[0] if paths else folder / "data" / f"0000000000{suffix}", archive)
     numbers = np.array([int(path.stem) for path in paths])
     try:
         lines = [line.strip() for line in stamps.read_text().splitlines()]
@@ -912,7 +926,7 @@ def _raw_stream(folder, suffix, archive):
 
 
 def _read_packet(path):
-    """A GPS/IMU packet, (30,) numbers in the order of oxts/dataformat.txt."""
+    """A GPS/IMU packet: (30,) numbers in the order of oxts/dataformat.txt."""
     try:
         packet = np.array(path.read_bytes().split(), dtype=float).reshape(30)
     except ValueError:
@@ -927,38 +941,44 @@ def _raw_calib(folder, archive):
     """The calib_*.txt of a date -> Tr (4,4), from Velodyne to rectified camera, and T_velo_imu."""
     def transform(name, rotation, translation=None):
         path = folder / name
-        _require(path, archive)
+        _require_file(path, archive)
+        R = _calib_row(path, rotation, 9).reshape(3, 3)
         t = _calib_row(path, translation, 3) if translation else np.zeros(3)
-        row = np.c_[_calib_row(path, rotation, 9).reshape(3, 3), t]
+        row = np.column_stack([R, t])  # (3,4)
         if not _is_rigid(row):
             raise ValueError(f"{path} is damaged: its row {rotation!r} should hold a rotation, "
                              f"and 'T' a translation; unpack {archive} again.")
-        return np.vstack([row, [0, 0, 0, 1]])
+        return np.vstack([row, [0, 0, 0, 1]])  # (4,4)
+
     rectify = transform("calib_cam_to_cam.txt", "R_rect_00")
-    return (rectify @ transform("calib_velo_to_cam.txt", "R", "T"),
-            transform("calib_imu_to_velo.txt", "R", "T"))
+    T_cam_velo = transform("calib_velo_to_cam.txt", "R", "T")
+    T_velo_imu = transform("calib_imu_to_velo.txt", "R", "T")
+    return rectify @ T_cam_velo, T_velo_imu
 
 
-def _imu_poses(packets, nearest, late):
-    """Poses T_wi (n,4,4) of the GPS/IMU unit (x forward, y left, z up), `late` (n,) seconds after
-    the packets `nearest` (n,) of all (m,30). The world is x east, y north, z up, in metres.
+def _imu_poses(packets, nearest, delay):
+    """Poses T_wi (n,4,4) of the GPS/IMU unit (x forward, y left, z up) at the times of the scans.
+
+    packets (m,30); nearest (n,): the packet nearest to each scan; delay (n,): time from the packet
+    to the scan [s]. The world is x east, y north, z up, in metres.
 
     The pose of a packet is that of the devkit's convertOxtsToPose.m: a Mercator projection with
     the scale of the drive's first latitude, and roll, pitch, yaw about x, y, z in that order.
-    Velocity and turn rate are constant from there: the unit moves along an arc, and the chord of
+    From there, velocity and turn rate are constant: the unit moves along an arc, and the chord of
     the arc has the direction of the velocity half-way.
     """
     scale = EARTH_RADIUS * np.cos(np.radians(packets[0, 0]))
-    packets, late = packets[nearest], late[:, None]
+    packets, delay = packets[nearest], delay[:, None]  # (n,30), (n,1)
     lat, lon, alt = packets[:, LAT_LON_ALT].T
-    east, north = scale * np.radians(lon), scale * np.log(np.tan(np.radians(90 + lat) / 2))
+    east = scale * np.radians(lon)
+    north = scale * np.log(np.tan(np.radians(90 + lat) / 2))
     position = np.stack([east, north, alt], axis=1)  # (n,3)
     attitude = Rotation.from_euler("xyz", packets[:, ROLL_PITCH_YAW])
-    turn = attitude.apply(packets[:, TURN_RATE]) * late  # (n,3) rotation vectors, world's axes
-    half_way = Rotation.from_rotvec(turn / 2)
-    T = np.tile(np.eye(4), (len(packets), 1, 1))
+    turn = attitude.apply(packets[:, TURN_RATE]) * delay  # (n,3) rotation vectors, world's axes
+    half_turn = Rotation.from_rotvec(turn / 2)
+    T = np.tile(np.eye(4), (len(packets), 1, 1))  # (n,4,4)
     T[:, :3, :3] = (Rotation.from_rotvec(turn) * attitude).as_matrix()
-    T[:, :3, 3] = position + half_way.apply(packets[:, VELOCITY] * late)
+    T[:, :3, 3] = position + half_turn.apply(packets[:, VELOCITY] * delay)
     return T
 
 
