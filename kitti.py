@@ -6,8 +6,8 @@ intensity [0..1]. `T_ab` maps points from frame b to frame a.
 KITTI's pose files are in the frame of the rectified left camera. The points are in the Velodyne
 frame, so `poses` and `motions()` of a sequence are, too: T_velo = inv(Tr) @ T_cam @ Tr.
 
-The simulated city replaces KITTI where it is not at hand: an HDL-64E drives through 11 small cities
-with exact ground truth: 2,620 scans, 4.2 GB. Needs NumPy and SciPy.
+The simulated city can be used in place of KITTI. An HDL-64E drives through 11 small cities, with
+exact ground truth: 2,620 scans, 4.2 GB. Needs NumPy and SciPy.
 
     python kitti.py simulate data/city
     python kitti.py simulate data/tiny --sequences 00 07 --scans 40 --azimuth 900
@@ -287,9 +287,9 @@ class ScanFolder(Sequence):
     """A plain folder of scans as a sequence: *.bin or *.npy, in natural order (2 before 10).
 
     name is the folder's. There is no calibration and no ground truth: Tr, poses_cam and poses are
-    None. intensity_max is what intensities are divided by, 1 or 255. times (n,) are the seconds in
-    the folder's times.txt, or else those of 10 scans a second. notes is a list of lines that say
-    what was assumed. Raises ValueError when the files do not fit together or are no scans.
+    None. Intensities are divided by intensity_max, 1 or 255. times (n,) are the seconds in the
+    folder's times.txt, or else those of 10 scans a second. notes is a list of lines, one for each
+    assumption made. Raises ValueError when the files do not fit together or are no scans.
     """
 
     def __init__(self, folder):
@@ -399,7 +399,7 @@ def open_sequences(root: str | Path, names: str | list[str] | None = None) -> li
     names: one or several of the folders under ROOT/sequences, the splits of SPLITS (those of their
     sequences that ROOT has), or "all"; None means "all". A ROOT without a folder sequences/ is one
     `ScanFolder`. Raises ValueError for a name that ROOT does not have or a split of which it has
-    nothing, and whatever `sequence_names`, `Sequence` and `ScanFolder` raise.
+    nothing, and the errors of `sequence_names`, `Sequence` and `ScanFolder`.
     """
     there = sequence_names(root)
     choices = {}
@@ -446,7 +446,7 @@ def usable_points(scan, max_range=None, plane=True):
         scan = np.asarray(scan, np.float32)
         if scan.ndim != 2 or scan.shape[1] != 4:
             raise ValueError(f"a scan has the shape (N, 4), not {scan.shape}; give x, y, z [m] and "
-                             "intensity of N points")
+                             "intensity for N points")
         x, y, z, intensity = scan.T  # (N,) each
         squared_range = x * x + y * y + z * z
         # A comparison with NaN is false
@@ -650,7 +650,7 @@ def run_folder(path):
     """Make a folder and hold it for one writer. If it is new and still empty at the end, remove it.
 
     The holder locks the file PATH/lock, which nothing else opens. The system unlocks it when the
-    process ends, in whatever way. Without fcntl, as on Windows, nothing is locked. Raises
+    process ends or is killed. Without fcntl, as on Windows, nothing is locked. Raises
     ValueError while another process holds the folder.
     """
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
@@ -1176,7 +1176,7 @@ def _hills(rng, T):
     return height, T_hills
 
 
-# What stands along the road
+# Houses, cars and plants along the road
 
 
 def _prisms(*columns):
@@ -1382,7 +1382,7 @@ class _World(NamedTuple):
 
     T: np.ndarray  # (scans,4,4) poses T_wt of the Velodyne
     T_flat: np.ndarray  # (scans,4,4) the same before the hills were added
-    prisms: np.ndarray  # (n,10) what stands still
+    prisms: np.ndarray  # (n,10) everything that stands still
     moving: Callable  # scan i -> prisms (m,10) of the cars on the road
     ground: tuple  # height and albedo of every cell, corner of the raster
     height: Callable  # x, y -> height of the hills
@@ -1529,7 +1529,7 @@ def _cross_prisms(p, eye, rays):
 
 
 def _hit_prisms(p, eye, rays, rng):
-    """What each ray hits first among prisms (n,10).
+    """The first hit of each ray on prisms (n,10).
 
     Returns (4,64 A): distance in plan (infinite for no hit), cosine of the angle of incidence,
     albedo, and the depth to which light can get in.
@@ -1646,7 +1646,7 @@ def _simulate_scan(name, seed, scans, azimuth, i):
 
     # Intensity. From 60 m on, KITTI's intensities are mostly 0.
     light = albedo * (0.65 + 0.4 * np.sqrt(cosine)) + 0.08 * noise() - 0.01 * np.maximum(r - 25, 0)
-    light[uniform() <= 0.08] *= 0
+    light[uniform() <= 0.08] *= 0  # some are lost; keeps the sign, so that files stay the same
 
     # Drop-outs: far and dark, grazing, or very dark
     far = 0.10 * (r / 40) ** 2 * (0.15 / (0.05 + albedo))
@@ -1759,7 +1759,7 @@ def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range
     validation, which drive more than 115 m, and 320 for all others); azimuth: rays per beam and
     turn; workers: processes (None: one per core).
 
-    The same arguments give the same bytes, whatever other sequences are made with them. A sequence
+    The same arguments give the same bytes, no matter which other sequences are made. A sequence
     appears when it is complete. One that is there already, made with the same settings, is left as
     it is. Raises ValueError for arguments out of range, or when ROOT holds such a sequence from
     elsewhere or with other settings, and OSError.
