@@ -1,18 +1,41 @@
-"""The data: KITTI odometry scans, calibration, frames, splits, the ground plane, and a simulated city for when there is no KITTI.
+"""The data: KITTI odometry scans, calibration, frames, splits, ground plane, simulated city.
 
-A scan is an (N,4) float32 array x, y, z [m], intensity [0..1] in the Velodyne frame: x forward, y left, z up. `T_ab` maps points from
-frame b to frame a. Pose files are in KITTI's rectified left camera frame; everything this module hands out as `poses` or `motions()` is
-in the Velodyne frame, because that is what the points are in: T_velo = inv(Tr) @ T_cam @ Tr. Needs NumPy and SciPy.
+A scan is an array (N,4) float32: x, y, z [m] in the Velodyne frame (x forward, y left, z up) and
+intensity [0..1]. `T_ab` maps points from frame b to frame a.
 
-    python kitti.py simulate data/city      # an HDL-64E drives through 11 little cities, with exact ground truth: 2,620 scans, 4.2 GB
+KITTI's pose files are in the frame of the rectified left camera. The points are in the Velodyne
+frame, so `poses` and `motions()` of a sequence are, too: T_velo = inv(Tr) @ T_cam @ Tr.
+
+The simulated city can be used in place of KITTI. An HDL-64E drives through 11 small cities, with
+exact ground truth: 2,620 scans, 4.2 GB. Needs NumPy and SciPy.
+
+    python kitti.py simulate data/city
     python kitti.py simulate data/tiny --sequences 00 07 --scans 40 --azimuth 900
-    python kitti.py raw DRIVE data/raw      # a drive of KITTI's raw data, with ground truth
+    python kitti.py raw DRIVE data/raw      # convert a drive of KITTI's raw data
 """
-import argparse, ctypes, functools, hashlib, importlib.metadata, itertools, json, os, platform, re, shutil, signal, subprocess, sys
-import threading, time, warnings, zlib
+import argparse
+import ctypes
+import functools
+import hashlib
+import importlib.metadata
+import itertools
+import json
+import os
+import platform
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+import warnings
+import zlib
+from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
@@ -25,16 +48,23 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-SPLITS = {"train": ("00", "01", "02", "08", "09"), "test": ("03", "04", "05", "06", "10"), "validation": ("07",)}  # paper, section 4
+# Section 4 of the paper
+SPLITS = {
+    "train": ("00", "01", "02", "08", "09"),
+    "test": ("03", "04", "05", "06", "10"),
+    "validation": ("07",),
+}
 
+# ------------------------------------------------------------------------------------------------
+# Files
 
-# ---------------------------------------------------------------------------------------------------------------- files
-
-FIVE_FLOATS = ("If it is nuScenes', with five floats per point, convert each file with "
+FIVE_FLOATS = ("nuScenes files have five floats per point: convert each with "
                "np.save(NEW, np.fromfile(OLD, np.float32).reshape(-1, 5)[:, :4])")
+OTHER_FORMATS = b"\x93NUMPY", b"ply\n", b"ply\r", b"# .PCD"  # how files of other formats begin
 
 
 def _check_scan_size(path, size):
+    """ValueError unless a .bin file of `size` bytes can hold a scan."""
     if size == 0 or size % 16:
         raise ValueError(f"{path} has {size} bytes, but a scan has 16 (four float32) per point: "
                          f"copy or unpack it again. {FIVE_FLOATS}.")
@@ -55,22 +85,26 @@ def read_scan(path: str | Path, intensity_max: float = 1) -> np.ndarray:
 
 
 def _read_bin(path):
+    """A .bin file -> scan (N,4) float32."""
     data = path.read_bytes()
-    if data.startswith((b"\x93NUMPY", b"ply\n", b"ply\r", b"# .PCD")):
-        raise ValueError(f"{path} is no KITTI scan but another format: read it with its own library and hand over x, y, z, intensity.")
+    if data.startswith(OTHER_FORMATS):
+        raise ValueError(f"{path} is not a KITTI scan but a file of another format: read it with "
+                         "its own library and save x, y, z, intensity as .npy.")
     _check_scan_size(path, len(data))
-    return np.frombuffer(data, "<f4").reshape(-1, 4).astype(np.float32)  # (N,4), a copy that may be written to
+    return np.frombuffer(data, "<f4").reshape(-1, 4).astype(np.float32)  # (N,4), a writable copy
 
 
 def _read_npy(path):
+    """A .npy file -> scan (N,4) float32."""
     try:
         points = np.load(path, allow_pickle=False)
     except OSError:
         raise
     except Exception:  # np.load raises many exception types; all of them mean a corrupt file
         raise ValueError(f"{path} is no NumPy file or is damaged: save the scan again.") from None
-    shape = getattr(points, "shape", ())  # an archive of several arrays has none
-    if len(shape) != 2 or shape[0] == 0 or shape[1] not in (3, 4) or points.dtype.kind not in "fiu":
+    shape = getattr(points, "shape", ())  # an archive of several arrays has no shape
+    if (len(shape) != 2 or shape[0] == 0 or shape[1] not in (3, 4)
+            or points.dtype.kind not in "fiu"):
         raise ValueError(f"{path} has shape {shape}, but a scan is an array of numbers (N,3) or "
                          "(N,4): save the columns x, y, z and intensity.")
     scan = np.zeros((len(points), 4), np.float32)
@@ -80,20 +114,26 @@ def _read_npy(path):
 
 
 def read_calib(path: str | Path) -> np.ndarray:
-    """calib.txt of a sequence -> T_cam0_velo (4,4) float64, its row `Tr`: Velodyne points to the rectified left camera [m].
-    Raises FileNotFoundError; ValueError when `Tr` is missing, is not 12 finite numbers or does not hold a rotation."""
+    """Read the row `Tr` of a sequence's calib.txt.
+
+    Returns T_cam0_velo (4,4) float64, which maps points from the Velodyne frame to the frame of the
+    rectified left camera [m]. Raises FileNotFoundError, and ValueError when `Tr` is missing or is
+    not 12 finite numbers with a rotation.
+    """
     path = Path(path)
-    get = "KITTI's is in data_odometry_calib.zip; for drives of your own write the line Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0"
+    remedy = ("KITTI's is in data_odometry_calib.zip; for drives of your own write the line "
+              "Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0")
     if not path.is_file():
-        raise FileNotFoundError(f"{path} does not exist: {get}.")
+        raise FileNotFoundError(f"{path} does not exist: {remedy}.")
     row = _calib_row(path, "Tr", 12).reshape(3, 4)
     if not _is_rigid(row):
-        raise ValueError(f"{path} has no row 'Tr' (Velodyne to camera) of 12 finite numbers, a rotation and a translation: {get}.")
+        raise ValueError(f"{path} has no row 'Tr' (Velodyne to camera) of 12 finite numbers, a "
+                         f"rotation and a translation: {remedy}.")
     return np.vstack([row, [0, 0, 0, 1]])  # (4,4)
 
 
 def _calib_row(path, name, count):
-    """Row `name` of a calibration file: (count,) numbers, all NaN when there is no such row."""
+    """The numbers (count,) of row `name` in a calibration file, NaN if there is no such row."""
     rows = re.findall(rb"^\s*%s\s*:(.*)$" % name.encode(), path.read_bytes(), re.M)
     try:
         return np.array(rows[0].split(), dtype=float).reshape(count)
@@ -104,53 +144,72 @@ def _calib_row(path, name, count):
 def _is_rigid(row):
     """Whether (3,4) is finite, with a rotation in its first three columns."""
     R = row[:, :3]
-    with np.errstate(all="ignore"):  # absurd numbers overflow
-        rotation = np.abs(R @ R.T - np.eye(3)).max() < 1e-3 and np.linalg.det(R) > 0
+    with np.errstate(all="ignore"):  # huge numbers overflow
+        deviation = np.abs(R @ R.T - np.eye(3)).max()
+        rotation = deviation < 1e-3 and np.linalg.det(R) > 0
     return bool(np.isfinite(row).all() and rotation)
-
-
-# --------------------------------------------------------------------------------------------------------------- frames
-
-def invert(T):
-    """The inverse of rigid transforms (...,4,4): [R t]^-1 = [R^T, -R^T t]. Cheaper and cleaner than a general inverse."""
-    T = np.asarray(T, dtype=float)
-    R = np.swapaxes(T[..., :3, :3], -1, -2)
-    out = np.zeros_like(T)
-    out[..., :3, :3], out[..., :3, 3:], out[..., 3, 3] = R, -R @ T[..., :3, 3:], 1
-    return out
 
 
 def write_tum(path: str | Path, T: np.ndarray, times: np.ndarray) -> None:
     """Write poses (n,4,4) at `times` (n,) [s] as a TUM trajectory file, through a temporary file.
 
-    A row is t x y z qx qy qz qw, with qw >= 0, in the frame of the poses."""
+    A row is t x y z qx qy qz qw, with qw >= 0, in the frame of the poses. Raises ValueError when
+    the numbers of poses and times differ, and OSError.
+    """
     q = Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True)  # (n,4)
     with replacing(path) as temporary, open(temporary, "w", newline="\n") as file:
         np.savetxt(file, np.c_[times, T[:, :3, 3], q], fmt="%.9f")
 
 
+# ------------------------------------------------------------------------------------------------
+# Frames
+
+
+def invert(T):
+    """The inverses of rigid transforms (...,4,4): R^T and -R^T t for R and t.
+
+    Faster and more accurate than a general matrix inverse.
+    """
+    T = np.asarray(T, dtype=float)
+    R_inverse = np.swapaxes(T[..., :3, :3], -1, -2)
+    out = np.zeros_like(T)
+    out[..., :3, :3] = R_inverse
+    out[..., :3, 3:] = -R_inverse @ T[..., :3, 3:]
+    out[..., 3, 3] = 1
+    return out
+
+
 def camera_to_velo(T_cam, Tr):
-    """Poses or motions (...,4,4) of the camera -> those of the Velodyne, inv(Tr) @ T @ Tr."""
+    """Camera poses or motions (...,4,4) -> those of the Velodyne, inv(Tr) @ T_cam @ Tr."""
     return invert(Tr) @ T_cam @ Tr
 
 
 def velo_to_camera(T_velo, Tr):
-    """Poses or motions (...,4,4) of the Velodyne -> those of the rectified left camera, Tr @ T @ inv(Tr)."""
+    """Velodyne poses or motions (...,4,4) -> those of the camera, Tr @ T_velo @ inv(Tr)."""
     return Tr @ T_velo @ invert(Tr)
 
 
 def to_vector(T: np.ndarray) -> np.ndarray:
-    """Rigid transforms (...,4,4) -> (...,6) float64: [tx, ty, tz] m, [roll, pitch, yaw] degrees, extrinsic x-y-z (paper 3.2)."""
+    """Rigid transforms as vectors, section 3.2 of the paper.
+
+    T (...,4,4) -> (...,6) float64: tx, ty, tz [m]; roll, pitch, yaw [degrees], the Euler angles
+    about the fixed axes x, y, z in that order.
+    """
     T = np.asarray(T, dtype=float)
     flat = T.reshape(-1, 4, 4)
-    with warnings.catch_warnings():  # gimbal lock (pitch +-90 degrees): scipy sets the third angle to zero, still the same rotation
-        warnings.simplefilter("ignore", UserWarning)
-        angles = Rotation.from_matrix(flat[:, :3, :3]).as_euler("xyz", degrees=True) if len(flat) else np.empty((0, 3))
-    return np.concatenate([flat[:, :3, 3], angles], axis=1).reshape(T.shape[:-2] + (6,))
+    angles = np.empty((0, 3))
+    if len(flat):
+        with warnings.catch_warnings():
+            # At a pitch of +-90 degrees (gimbal lock), scipy warns and sets the third angle to
+            # zero. The rotation is still the same.
+            warnings.simplefilter("ignore", UserWarning)
+            angles = Rotation.from_matrix(flat[:, :3, :3]).as_euler("xyz", degrees=True)
+    vectors = np.concatenate([flat[:, :3, 3], angles], axis=1)
+    return vectors.reshape(T.shape[:-2] + (6,))
 
 
 def from_vector(v: np.ndarray) -> np.ndarray:
-    """The inverse of `to_vector`: (...,6) metres and degrees -> (...,4,4) float64."""
+    """The inverse of `to_vector`: (...,6) in metres and degrees -> (...,4,4) float64."""
     v = np.asarray(v, dtype=float)
     flat = v.reshape(-1, 6)
     T = np.tile(np.eye(4), (len(flat), 1, 1))
@@ -160,36 +219,49 @@ def from_vector(v: np.ndarray) -> np.ndarray:
     return T.reshape(v.shape[:-1] + (4, 4))
 
 
-# ------------------------------------------------------------------------------------------------------------ sequences
+# ------------------------------------------------------------------------------------------------
+# Sequences
+
 
 class Sequence:
-    """One sequence of ROOT in KITTI's layout, checked before anything is used: ROOT/sequences/NAME/{velodyne/000000.bin ..., calib.txt}
-    and, where there is ground truth, ROOT/poses/NAME.txt.
+    """A sequence of ROOT in KITTI's layout. All its files are checked when it is opened.
 
-    name, scan_paths (list of n paths), Tr (4,4) = T_cam0_velo, poses_cam (n,4,4) as in the file or None, poses (n,4,4) = T_0t in the
-    Velodyne frame or None. Raises FileNotFoundError or ValueError when anything is missing or does not fit together."""
-    intensity_max = 1  # of the files; KITTI's intensities are within 0..1
+    The files are ROOT/sequences/NAME/velodyne/000000.bin ..., ROOT/sequences/NAME/calib.txt and,
+    where there is ground truth, ROOT/poses/NAME.txt.
+
+    name, folder: its name and ROOT/sequences/NAME; scan_paths: list of n paths; Tr (4,4):
+    T_cam0_velo; poses_cam (n,4,4): the poses as in the file; poses (n,4,4): T_0t in the Velodyne
+    frame. Both are None without ground truth. Raises FileNotFoundError for a missing file, and
+    ValueError for a damaged one or when the numbers of scans and poses differ.
+    """
+
+    intensity_max = 1  # intensities are divided by this; KITTI's are within 0..1
 
     def __init__(self, root, name):
-        self.name, self.folder = name, Path(root) / "sequences" / name
+        self.name = name
+        self.folder = Path(root) / "sequences" / name
         velodyne = self.folder / "velodyne"
         self.scan_paths = sorted(velodyne.glob("*.bin"))
         if not self.scan_paths:
-            raise FileNotFoundError(f"{velodyne} holds no scans: unpack data_odometry_velodyne.zip over it, other archives have none.")
+            raise FileNotFoundError(f"{velodyne} holds no scans: unpack data_odometry_velodyne.zip "
+                                    "over it, other archives have none.")
         for i, path in enumerate(self.scan_paths):
             if path.name != f"{i:06d}.bin":
-                raise ValueError(f"{velodyne} should hold {i:06d}.bin next but holds {path.name}: scans are numbered from 000000 without "
-                                 "a gap, unpack data_odometry_velodyne.zip again.")
-            _check_scan_size(path, os.stat(path).st_size)
+                raise ValueError(f"{velodyne} should hold {i:06d}.bin next but holds {path.name}: "
+                                 "scans are numbered from 000000 without a gap, unpack "
+                                 "data_odometry_velodyne.zip again.")
+            _check_scan_size(path, path.stat().st_size)
         self.Tr = read_calib(self.folder / "calib.txt")
+
         self.poses_cam = self.poses = None
         truth = Path(root) / "poses" / f"{name}.txt"
         if truth.exists():
             self.poses_cam = read_poses(truth)  # (n,4,4)
             if len(self.poses_cam) != len(self):
-                raise ValueError(f"{truth} has {len(self.poses_cam)} poses but {velodyne} has {len(self)} scans: "
-                                 "the two must agree, unpack whichever is incomplete again.")
-            self.poses = camera_to_velo(self.poses_cam, self.Tr)
+                raise ValueError(f"{truth} has {len(self.poses_cam)} poses but {velodyne} has "
+                                 f"{len(self)} scans: the two must agree, unpack whichever is "
+                                 "incomplete again.")
+            self.poses = camera_to_velo(self.poses_cam, self.Tr)  # (n,4,4)
 
     def __len__(self):
         return len(self.scan_paths)
@@ -199,12 +271,15 @@ class Sequence:
         return read_scan(self.scan_paths[i], self.intensity_max)
 
     def motions(self) -> np.ndarray:
-        """(n-1,4,4) T_{t,t+1} = inv(T_t) @ T_{t+1} (paper eq. 1) in the Velodyne frame: maps points of scan t+1 into scan t.
-        Raises ValueError when the sequence has no ground truth."""
+        """True motions T_{t,t+1} = inv(T_t) @ T_{t+1} (n-1,4,4), eq. 1 of the paper.
+
+        They are in the Velodyne frame and map points of scan t+1 to the frame of scan t. Raises
+        ValueError when the sequence has no ground truth.
+        """
         if self.poses is None:
             raise ValueError(f"Sequence {self.name} has no ground truth: put it into ROOT/poses/"
                              f"{self.name}.txt beside ROOT/sequences (SemanticKITTI's sequences/"
-                             f"{self.name}/poses.txt is no truth, SuMa estimated it).")
+                             f"{self.name}/poses.txt is not ground truth: SuMa estimated it).")
         return invert(self.poses[:-1]) @ self.poses[1:]
 
 
@@ -212,9 +287,9 @@ class ScanFolder(Sequence):
     """A plain folder of scans as a sequence: *.bin or *.npy, in natural order (2 before 10).
 
     name is the folder's. There is no calibration and no ground truth: Tr, poses_cam and poses are
-    None. intensity_max is what intensities are divided by, 1 or 255. times (n,) are the seconds in
-    the folder's times.txt, or else those of 10 scans a second. notes is a list of lines that say
-    what was assumed. Raises ValueError when the files do not fit together or are no scans.
+    None. Intensities are divided by intensity_max, 1 or 255. times (n,) are the seconds in the
+    folder's times.txt, or else those of 10 scans a second. notes is a list of lines, one for each
+    assumption made. Raises ValueError when the files do not fit together or are no scans.
     """
 
     def __init__(self, folder):
@@ -227,29 +302,37 @@ class ScanFolder(Sequence):
         for path in self.scan_paths:
             if path.suffix == ".bin":
                 _check_scan_size(path, path.stat().st_size)
+
+        self.notes = []
         largest = _largest_intensity(self.scan_paths)
         self.intensity_max = 255 if largest > 1 else 1
-        self.times, self.notes = 0.1 * np.arange(len(self)), []
         if largest == 0:
             self.notes.append("there are no intensities; zeros are used, so expect larger errors")
         if largest > 1:
             self.notes.append(f"intensities reach {largest:.4g}; all are divided by 255")
+
         if (self.folder / "times.txt").exists():
             self.times = _read_times(self.folder / "times.txt", len(self))
         else:
+            self.times = 0.1 * np.arange(len(self))
             self.notes.append("there is no times.txt, one time in seconds per line; "
                               "10 scans a second are assumed")
 
 
 def scans_in(folder):
     """The *.bin and *.npy files of a folder, in natural order: list of paths."""
+    def with_padded_numbers(path):  # "2.bin" comes before "10.bin"
+        return re.sub(r"\d+", lambda digits: digits[0].zfill(20), path.name)
+
     paths = [path for path in Path(folder).glob("[!.]*") if path.suffix in (".bin", ".npy")]
-    pad = lambda digits: digits[0].zfill(20)
-    return sorted(paths, key=lambda path: re.sub(r"\d+", pad, path.name))
+    return sorted(paths, key=with_padded_numbers)
 
 
 def _largest_intensity(paths):
-    """The largest intensity of ten scans spread over a folder; ValueError if it cannot be one."""
+    """The largest intensity in ten scans spread over a folder.
+
+    ValueError for one below 0 or above 255, which cannot be an intensity.
+    """
     largest = 0
     for i in np.unique(np.linspace(0, len(paths) - 1, 10).astype(int)):
         intensity = read_scan(paths[i])[:, 3]
@@ -266,7 +349,7 @@ def _largest_intensity(paths):
 
 
 def _read_times(path, n):
-    """(n,) seconds, one per line and increasing; ValueError when the file holds anything else."""
+    """The times (n,) [s] in a times.txt, one per line. ValueError unless they increase."""
     try:
         times = np.array(path.read_bytes().split(), dtype=float)
     except ValueError:
@@ -277,134 +360,212 @@ def _read_times(path, n):
     return times
 
 
+def _is_plain_folder(root):
+    """Whether ROOT is a plain folder of scans and not KITTI's odometry layout."""
+    return not (Path(root) / "sequences").exists()
+
+
+def _is_raw_data(root):
+    """Whether ROOT looks like KITTI's raw data, a drive or a folder of drives."""
+    paths = root, *root.glob("*"), *root.glob("*/*")
+    return any(re.search(r"_drive_\d+|^velodyne_points$", path.name) for path in paths)
+
+
 def sequence_names(root: str | Path) -> list[str]:
-    """The sequences of ROOT that have scans; a plain folder of scans is one, with its name.
-    Raises FileNotFoundError when there are none, as in an unknown layout."""
+    """The names of the sequences of ROOT that have scans, sorted.
+
+    A plain folder of scans is one sequence with the folder's name. Raises FileNotFoundError when
+    there are no scans, or none in a known layout.
+    """
     root = Path(root)
-    if not (root / "sequences").exists() and scans_in(root):
+    if _is_plain_folder(root) and scans_in(root):
         return [root.resolve().name]
-    there = sorted(p.parent.name for p in root.glob("sequences/[!.]*/velodyne") if next(p.glob("*.bin"), None))
-    if not there:
-        raw = any(re.search(r"_drive_\d+|^velodyne_points$", p.name) for p in (root, *root.glob("*"), *root.glob("*/*")))
+    folders = root.glob("sequences/[!.]*/velodyne")
+    names = sorted(folder.parent.name for folder in folders if any(folder.glob("*.bin")))
+    if not names:
         remedy = "check the path and unpack its archives"
-        if raw:
+        if _is_raw_data(root):
             remedy = "convert KITTI's raw data with `python kitti.py raw DRIVE ROOT`"
         raise FileNotFoundError(
-            f"{root} has no scans in a known layout: {remedy}. Known are a folder of *.bin or *.npy "
-            "files, and KITTI's odometry layout, ROOT/sequences/00/{velodyne/000000.bin, calib.txt} "
-            "and ROOT/poses/00.txt.")
-    return there
+            f"{root} has no scans in a known layout: {remedy}. Known are a folder of *.bin or "
+            "*.npy files, and KITTI's odometry layout, ROOT/sequences/00/{velodyne/000000.bin, "
+            "calib.txt} and ROOT/poses/00.txt.")
+    return names
 
 
 def open_sequences(root: str | Path, names: str | list[str] | None = None) -> list[Sequence]:
-    """ROOT and names -> list of `Sequence`, in the order given, each once. A name is a folder under ROOT/sequences, a split of SPLITS (as
-    much of it as there is) or 'all'; None is 'all'. A ROOT without sequences/ is one `ScanFolder`.
-    Raises ValueError for an unknown name or a split of which nothing is there, and whatever
-    `sequence_names`, `Sequence` and `ScanFolder` raise."""
+    """Open sequences of ROOT, in the order given, each once.
+
+    names: one or several of the folders under ROOT/sequences, the splits of SPLITS (those of their
+    sequences that ROOT has), or "all"; None means "all". A ROOT without a folder sequences/ is one
+    `ScanFolder`. Raises ValueError for a name that ROOT does not have or a split of which it has
+    nothing, and the errors of `sequence_names`, `Sequence` and `ScanFolder`.
+    """
     there = sequence_names(root)
-    choices = {split: [n for n in part if n in there] for split, part in SPLITS.items()} | {"all": there} | {n: [n] for n in there}
-    names = ["all"] if names is None else [names] if isinstance(names, str) else list(names)
+    choices = {}
+    for split, members in SPLITS.items():
+        choices[split] = [name for name in members if name in there]
+    choices["all"] = there
+    for name in there:
+        choices[name] = [name]
+
+    if names is None:
+        names = ["all"]
+    elif isinstance(names, str):
+        names = [names]
+    chosen = {}  # a dict keeps the order
     for name in names:
         if not choices.get(name):
-            raise ValueError(f"{root} has no sequence or split {name!r} with scans: there are {' '.join(n for n in choices if choices[n])}.")
-    chosen = dict.fromkeys(n for name in names for n in choices[name])
-    plain = not (Path(root) / "sequences").exists()
-    return [ScanFolder(root) if plain else Sequence(root, n) for n in chosen]
+            known = " ".join(choice for choice, members in choices.items() if members)
+            raise ValueError(f"{root} has no sequence or split {name!r} with scans: choose from "
+                             f"{known}.")
+        chosen |= dict.fromkeys(choices[name])
+    if _is_plain_folder(root):
+        return [ScanFolder(root) for _ in chosen]
+    return [Sequence(root, name) for name in chosen]
 
 
-# ------------------------------------------------------------------------------------------------ from a scan to a cloud
+# ------------------------------------------------------------------------------------------------
+# From a scan to a point cloud
 
-BROKEN_RANGE, BROKEN_INTENSITY = 1000.0, 65536  # m; no LiDAR returns more, so such points are broken
-# Scan statistics, used to warn about domain shift.
-STATS = "usable points", "mean intensity", "median range of the centroids [m]", "share of points in the fullest 0.3 m of height, the ground"
+BROKEN_RANGE, BROKEN_INTENSITY = 1000.0, 65536  # [m]; no LiDAR returns more
+# Scan statistics, used to warn about domain shift
+STATS = ("usable points", "mean intensity", "median range of the centroids [m]",
+         "share of points in the densest 0.3 m of height (the ground)")
 
 
 def usable_points(scan, max_range=None, plane=True):
-    """The points of a scan that the network is given: (N,4) -> (M,4) float32, and how many broken points were dropped.
+    """The points of a scan that the network is given, and the number of broken points.
 
-    Broken points (not finite, or of a range or intensity that no LiDAR returns) go first, then points beyond `max_range` metres
-    (None: none of them), then, unless `plane`, the ground. The order stays. ValueError for another shape than (N,4)."""
+    (N,4) -> (M,4) float32, in the same order. Broken points are dropped first: those that are not
+    finite, or of a range or intensity that no LiDAR returns. Then points beyond `max_range` metres
+    are dropped (None: keep all) and, unless `plane`, the ground. Raises ValueError for another
+    shape than (N,4).
+    """
     with np.errstate(over="ignore", invalid="ignore"):
         scan = np.asarray(scan, np.float32)
         if scan.ndim != 2 or scan.shape[1] != 4:
-            raise ValueError(f"a scan has the shape (N, 4): x, y, z [m] and intensity, not {scan.shape}")
-        x, y, z, intensity = scan.T
-        squared = x * x + y * y + z * z
-        sound = (squared < BROKEN_RANGE ** 2) & (np.abs(intensity) < BROKEN_INTENSITY)  # NaN compares false
-        near = squared < (max_range or BROKEN_RANGE) ** 2
-    kept = scan[sound & near]
-    return kept if plane else remove_plane(kept), np.count_nonzero(~sound)
+            raise ValueError(f"a scan has the shape (N, 4), not {scan.shape}; give x, y, z [m] and "
+                             "intensity for N points")
+        x, y, z, intensity = scan.T  # (N,) each
+        squared_range = x * x + y * y + z * z
+        # A comparison with NaN is false
+        in_range = squared_range < BROKEN_RANGE**2
+        intact = in_range & (np.abs(intensity) < BROKEN_INTENSITY)
+        near = squared_range < (max_range or BROKEN_RANGE) ** 2
+    broken = np.count_nonzero(~intact)
+    kept = scan[intact & near]  # (M,4)
+    if not plane:
+        kept = remove_plane(kept)
+    return kept, broken
 
 
 def scan_stats(scan, centroids):
-    """The usable points of a scan (M,4) and the centroids sampled from them (S,3) -> (4,) STATS."""
-    layer = np.floor(np.clip(scan[:, 2], -100, 100) / 0.3).astype(int)
-    ground = np.bincount(layer - layer.min()).max() / len(scan)
-    return np.array([len(scan), scan[:, 3].mean(dtype=float), np.median(np.linalg.norm(centroids, axis=1)), ground])
+    """Usable points (M,4) and the centroids sampled from them (S,3) -> STATS (4,) of the scan."""
+    height = np.clip(scan[:, 2], -100, 100)
+    layer = np.floor(height / 0.3).astype(int)  # (M,)
+    points_in_layer = np.bincount(layer - layer.min())
+    ground_share = points_in_layer.max() / len(scan)
+    centroid_range = np.linalg.norm(centroids, axis=1)  # (S,)
+    mean_intensity = scan[:, 3].mean(dtype=float)
+    return np.array([len(scan), mean_intensity, np.median(centroid_range), ground_share])
 
 
 def domain_shift(stats, seen):
-    """Which STATS (4,) lie outside the range seen in training (2,4), by more than a factor of 1.5 -> a text, empty if none."""
-    return "; ".join(f"{name} {x:.3g} (in training {low:.3g} to {high:.3g})" for name, x, low, high in zip(STATS, stats, *seen)
-                     if not low / 1.5 <= x <= high * 1.5)
+    """Which statistics of a scan lie outside the range seen in training, by a factor of 1.5.
+
+    stats: STATS (4,); seen (2,4): their least and largest values in training. Returns a text that
+    names them, empty if there are none.
+    """
+    shifts = []
+    for name, x, low, high in zip(STATS, stats, *seen):
+        if not low / 1.5 <= x <= high * 1.5:
+            shifts.append(f"{name} {x:.3g} (in training {low:.3g} to {high:.3g})")
+    return "; ".join(shifts)
 
 
+def remove_plane(scan: np.ndarray, threshold=0.15, max_tilt=15.0, hypotheses=400, subsample=4000,
+                 seed=0) -> np.ndarray:
+    """Remove the ground plane from a scan by RANSAC, section 4 of the paper.
 
-def remove_plane(scan: np.ndarray, threshold=0.15, max_tilt=15.0, hypotheses=400, subsample=4000, seed=0) -> np.ndarray:
-    """A scan (N,3+) -> the scan without the points nearer than `threshold` [m] to its dominant near-horizontal plane (RANSAC; paper 4).
-
-    Planes through three random points whose normal is within `max_tilt` degrees of vertical are scored all at once on a random subsample;
-    the best is fitted again, twice, to all its inliers. Order and non-finite points are kept; unchanged when no plane qualifies."""
+    (N,3) or more columns -> the points that are `threshold` metres or more away from the dominant
+    plane whose normal is within `max_tilt` degrees of vertical. `hypotheses` planes through three
+    random points are scored on `subsample` random points; the best is fitted twice to all its
+    inliers. Order and non-finite points are kept. The scan is unchanged when no plane qualifies.
+    """
     rng = np.random.default_rng(seed)
     xyz = np.ascontiguousarray(scan[:, :3], dtype=np.float32)  # (N,3)
-    good = np.flatnonzero(np.isfinite(xyz).all(axis=1))
-    if len(good) < 3:
+    finite = np.flatnonzero(np.isfinite(xyz).all(axis=1))
+    if len(finite) < 3:
         return scan
-    a, b, c = xyz[good[rng.integers(len(good), size=(3, hypotheses))]].astype(float)  # (H,3) each
+    min_cosine = np.cos(np.radians(max_tilt))
+
+    # Hypotheses: planes normal . x = offset through three random points a, b, c
+    triples = finite[rng.integers(len(finite), size=(3, hypotheses))]
+    a, b, c = xyz[triples].astype(float)  # (H,3) each
     normal = np.cross(b - a, c - a)  # (H,3)
     length = np.linalg.norm(normal, axis=1)
-    upright = np.abs(normal[:, 2]) > np.cos(np.radians(max_tilt)) * np.maximum(length, 1e-9)
+    upright = np.abs(normal[:, 2]) > min_cosine * np.maximum(length, 1e-9)
     if not upright.any():
         return scan
     normal = normal[upright] / length[upright, None]
-    offset = (normal * a[upright]).sum(axis=1)  # a plane is normal . x = offset
-    sample = xyz[good[rng.integers(len(good), size=min(subsample, len(good)))]]  # (M,3)
-    distance = np.abs(normal.astype(np.float32) @ sample.T - offset[:, None].astype(np.float32))  # (H,M)
+    offset = (normal * a[upright]).sum(axis=1)  # (H,)
+
+    # Score them by the number of inliers among M random points
+    sample = xyz[finite[rng.integers(len(finite), size=min(subsample, len(finite)))]]  # (M,3)
+    projected = normal.astype(np.float32) @ sample.T  # (H,M)
+    distance = np.abs(projected - offset[:, None].astype(np.float32))  # (H,M)
     best = (distance < threshold).sum(axis=1).argmax()
     n, d = normal[best], offset[best]
 
-    def near(n, d):
-        with np.errstate(invalid="ignore", over="ignore"):  # NaN compares false, so it is never near
-            return np.abs(xyz @ n.astype(np.float32) - np.float32(d)) < threshold  # (N,)
+    def inliers(n, d):  # (N,) bool
+        with np.errstate(invalid="ignore", over="ignore"):  # NaN is never an inlier
+            return np.abs(xyz @ n.astype(np.float32) - np.float32(d)) < threshold
+
+    # Least squares: the normal is the direction in which the inliers vary least
     for _ in range(2):
-        inlier = xyz[near(n, d)]
-        if len(inlier) < 3:
+        points = xyz[inliers(n, d)]
+        if len(points) < 3:
             return scan
-        mean = inlier.mean(axis=0, dtype=float)
-        centred = inlier - mean.astype(np.float32)
-        n = np.linalg.eigh((centred.T @ centred).astype(float))[1][:, 0]  # least squares: the direction of least spread
+        mean = points.mean(axis=0, dtype=float)
+        centred = points - mean.astype(np.float32)
+        covariance = (centred.T @ centred).astype(float)  # (3,3), but for a factor
+        _, directions = np.linalg.eigh(covariance)  # by increasing variance
+        n = directions[:, 0]
         d = n @ mean
-    return scan if abs(n[2]) < np.cos(np.radians(max_tilt)) else scan[~near(n, d)]  # a wall alone is no ground
+    if abs(n[2]) < min_cosine:  # a wall, for example
+        return scan
+    return scan[~inliers(n, d)]
 
 
-# ----------------------------------------------------------------------------------------------------------- long work
+# ------------------------------------------------------------------------------------------------
+# Long work: progress, processes, signals, folders of training runs
+
 
 def progress(items, total, what):
-    """Yields the items while saying on stderr how many of `total` are done, how fast, and how long the rest will take. On a terminal the
-    line is rewritten in place; elsewhere a plain line comes every 10 s, or every tenth of the time so far when that is longer."""
-    tty, began, done = sys.stderr.isatty(), time.monotonic(), 0
-    due = began + (0.2 if tty else 10)  # s, when to say something again
+    """Yield the items and report on stderr: how many of `total` are done, the rate, the time left.
+
+    On a terminal the line is rewritten in place. Elsewhere a line is printed every 10 s, or after
+    every tenth of the time so far when that is longer.
+    """
+    tty = sys.stderr.isatty()
+    began, done = time.monotonic(), 0
+    due = began + (0.2 if tty else 10)  # time of the next message [s]
 
     def say(end):
         rate = done / max(time.monotonic() - began, 1e-9)
         minutes, seconds = divmod(round((total - done) / rate), 60)
         line = f"{what}: {done}/{total}, {rate:.3g} /s, {minutes}:{seconds:02d} left"
-        print(f"\r{line:<79}" if tty else line, end=end, file=sys.stderr, flush=True)
+        if tty:
+            line = f"\r{line:<79}"
+        print(line, end=end, file=sys.stderr, flush=True)
+
     try:
-        for done, item in enumerate(items):
-            if done and time.monotonic() > due:
+        for item in items:
+            now = time.monotonic()
+            if done and now > due:
                 say("" if tty else "\n")
-                due = time.monotonic() + (0.2 if tty else max(10, (time.monotonic() - began) / 10))
+                due = now + (0.2 if tty else max(10, (now - began) / 10))
             yield item
             done += 1
     finally:
@@ -413,27 +574,34 @@ def progress(items, total, what):
 
 
 def cores():
-    """Cores this process may use; at most 61, the most worker processes that Windows allows."""
-    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Number of cores this process may use, at most 61: Windows allows no more worker processes."""
+    if hasattr(os, "sched_getaffinity"):
+        count = len(os.sched_getaffinity(0))
+    else:
+        count = os.cpu_count() or 1
     return min(count, 61)
 
 
 def in_processes(function, tasks, workers=None, chunksize=4):
     """Yield function(task) for every task, in order, computed by a pool of worker processes.
 
-    OSError when a worker process died."""
-    pool = ProcessPoolExecutor(workers or cores(), initializer=_worker_starts)
+    workers: number of processes, None for one per core; chunksize: tasks sent to a worker at once.
+    Raises OSError when a worker died.
+    """
+    pool = ProcessPoolExecutor(workers or cores(), initializer=_leave_signals_to_parent)
     try:
         yield from pool.map(function, tasks, chunksize=chunksize)
     except BrokenExecutor:
-        raise OSError("a worker process died. A script needs the line if __name__ == '__main__': before its main part where "
-                      "processes are spawned, as on macOS and Windows; otherwise look for a lack of memory") from None
+        raise OSError("a worker process died. Where processes are spawned, as on macOS and "
+                      "Windows, a script needs the line if __name__ == '__main__': before its main "
+                      "part. Otherwise check the free memory") from None
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def _worker_starts():
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which stops its workers
+def _leave_signals_to_parent():
+    """Let a worker ignore Ctrl-C, which the parent handles, and end at SIGTERM."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
@@ -444,10 +612,11 @@ def terminate_as_interrupted():
 
 
 def keep_freed_memory():
-    """Let glibc keep large freed blocks.
+    """Let glibc keep large freed blocks instead of returning them to the system.
 
-    It would return them to the system and fault them in again at the next allocation, which is a third of the time of a
-    training step on a CPU."""
+    Otherwise every allocation faults its pages in again, a third of the time of a training step on
+    a CPU.
+    """
     try:
         libc = ctypes.CDLL(None)
         libc.mallopt(-4, 0)  # M_MMAP_MAX: large blocks come from the heap too
@@ -457,9 +626,12 @@ def keep_freed_memory():
 
 
 def versions(folder):
-    """Versions of Python and the packages, and the git commit of the code in `folder`, where there is one."""
-    git = shutil.which("git") if (Path(folder) / ".git").exists() else None
-    commit = git and subprocess.run([git, "-C", folder, "describe", "--always", "--dirty"], capture_output=True, text=True).stdout.strip()
+    """Versions of Python and the packages, and the git commit of the code in `folder`, if any."""
+    commit = None
+    git = shutil.which("git")
+    if git and (Path(folder) / ".git").exists():
+        describe = [git, "-C", folder, "describe", "--always", "--dirty"]
+        commit = subprocess.run(describe, capture_output=True, text=True).stdout.strip()
     packages = {name: importlib.metadata.version(name) for name in ("numpy", "scipy", "torch")}
     return {"commit": commit, "python": platform.python_version(), **packages}
 
@@ -475,20 +647,22 @@ def new_name(parent):
 
 @contextmanager
 def run_folder(path):
-    """Make a folder and hold it for one writer: ValueError while another process does. An empty one is removed at the end.
+    """Make a folder and hold it for one writer. If it is new and still empty at the end, remove it.
 
-    The holder locks the file PATH/lock, which nothing else opens; the system unlocks it when the process ends, however it
-    ends. Without fcntl, as on Windows, nothing is locked."""
+    The holder locks the file PATH/lock, which nothing else opens. The system unlocks it when the
+    process ends or is killed. Without fcntl, as on Windows, nothing is locked. Raises
+    ValueError while another process holds the folder.
+    """
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     path.mkdir(parents=True, exist_ok=True)
-    lock = open(path / "lock", "a+", encoding="utf-8")
-    with lock:
+    with open(path / "lock", "a+", encoding="utf-8") as lock:
         if fcntl:
             try:
                 fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 lock.seek(0)
-                raise ValueError(f"{path}: another training run writes to it, {lock.read().strip() or 'just started'}; wait for "
+                holder = lock.read().strip() or "just started"
+                raise ValueError(f"{path}: another training run writes to it, {holder}; wait for "
                                  "its end, or choose another folder") from None
         lock.truncate(0)
         lock.write(f"process {os.getpid()} on {platform.node()}\n")
@@ -496,7 +670,7 @@ def run_folder(path):
         try:
             yield
         finally:
-            if made and [p.name for p in path.iterdir()] == ["lock"]:
+            if made and [file.name for file in path.iterdir()] == ["lock"]:
                 (path / "lock").unlink()
                 with suppress(OSError):  # another process has just begun to use it
                     for folder in made:
@@ -505,103 +679,138 @@ def run_folder(path):
 
 @contextmanager
 def delayed_interrupt():
-    """Ctrl-C and SIGTERM wait for the work under way: yields a list that holds the signal once one came.
+    """Delay Ctrl-C and SIGTERM: yield a list to which a signal is added instead of interrupting.
 
-    A second signal interrupts at once. Outside the main thread signals are left alone (Python's rule)."""
-    received, before = [], {}
+    A second signal interrupts at once. Outside the main thread, where Python does not let us handle
+    signals, nothing is delayed.
+    """
+    received, handlers = [], {}
 
     def note(number, frame):
         if received:
             raise KeyboardInterrupt
         received.append(number)
+
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGINT, signal.SIGTERM):
-            before[number] = signal.signal(number, note)
+            handlers[number] = signal.signal(number, note)
     try:
         yield received
     finally:
-        for number, handler in before.items():
+        for number, handler in handlers.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
-# ---------------------------------------------------------------------------------------------------------------- cache
+# ------------------------------------------------------------------------------------------------
+# Cache
+
 
 def cached_records(sequences, compute, dtype, settings, cache="cache"):
     """Compute a record for every scan, once: later calls read the records from files.
 
-    sequences: list of `Sequence`; compute: a function scan (N,4) -> record of `dtype` that can be pickled; settings:
-    whatever else the records depend on. Returns two lists with an entry for each sequence: records (n,), memory-mapped, and
-    the CRC-32 of every scan (n,) uint32, by which `fingerprint` identifies the data.
+    sequences: a list of `Sequence`; compute: a function from a scan (N,4) to a record of `dtype`,
+    which can be pickled; settings: everything else that the records depend on. Returns two lists
+    with an entry for each sequence: records (n,), memory-mapped, and the CRC-32 of every scan (n,)
+    uint32, from which `fingerprint` identifies the data.
 
-    The name of a file is a hash of the settings and of the path, size and times of every scan, so a stale file is never read.
-    Files are moved into place when complete, so two processes may share a cache. A damaged file is made again. Scans are
-    shared out over the cores. ValueError, naming the file, for a scan that `compute` refuses."""
-    stored = np.dtype([("record", dtype), ("scan_crc", "u4"), ("crc", "u4")])
+    A file's name is a hash of the settings and of the path, size and times of every scan, so a
+    stale file is never read. A damaged file is made again. Files are moved into place when they are
+    complete, so two processes may share a cache. All cores share the work. Raises ValueError,
+    naming the file, for a scan that `compute` refuses.
+    """
+    row_dtype = np.dtype([("record", dtype), ("scan_crc", "u4"), ("crc", "u4")])
     files = [Path(cache) / f"{s.name}-{_cache_key(s, settings, dtype)}.npy" for s in sequences]
-    missing = [(s, file) for s, file in zip(sequences, files) if not _is_intact(file, stored, len(s))]
+    missing = [(s, file) for s, file in zip(sequences, files)
+               if not _is_intact(file, row_dtype, len(s))]
     if missing:
-        tasks = [(path, s.intensity_max) for s, _ in missing for path in s.scan_paths]
-        row_of = functools.partial(_cache_row, compute=compute, dtype=stored)
-        with closing(in_processes(row_of, tasks)) as rows:
-            rows = progress(rows, len(tasks), "sampling and grouping, scans")
-            for s, file in missing:
-                header = {"descr": np.lib.format.dtype_to_descr(stored), "fortran_order": False, "shape": (len(s),)}
-                with replacing(file) as temporary, open(temporary, "wb") as out:  # a memory map would crash on a full disk
-                    np.lib.format.write_array_header_1_0(out, header)
-                    for _ in range(len(s)):
-                        out.write(next(rows))
-            next(rows, None)  # lets the progress line end
+        _write_cache(missing, compute, row_dtype)
     loaded = [np.load(file, mmap_mode="r") for file in files]
-    return [rows["record"] for rows in loaded], [np.array(rows["scan_crc"]) for rows in loaded]
+    records = [rows["record"] for rows in loaded]
+    scan_crcs = [np.array(rows["scan_crc"]) for rows in loaded]
+    return records, scan_crcs
+
+
+def _write_cache(missing, compute, row_dtype):
+    """Compute and write the cache files of a list of (sequence, file)."""
+    tasks = [(path, s.intensity_max) for s, _ in missing for path in s.scan_paths]
+    compute_row = functools.partial(_cache_row, compute=compute, row_dtype=row_dtype)
+    with closing(in_processes(compute_row, tasks)) as rows:
+        rows = progress(rows, len(tasks), "sampling and grouping, scans")
+        for s, file in missing:
+            header = {"descr": np.lib.format.dtype_to_descr(row_dtype), "fortran_order": False,
+                      "shape": (len(s),)}
+            # Written row by row: a memory map would crash on a full disk
+            with replacing(file) as temporary, open(temporary, "wb") as out:
+                np.lib.format.write_array_header_1_0(out, header)
+                for _ in range(len(s)):
+                    out.write(next(rows))
+        next(rows, None)  # lets the progress line end
 
 
 def _cache_key(sequence, settings, dtype):
-    """Hash of all that a cache file depends on. The change time (ctime) notices what keeps size and modification time."""
+    """Hash of everything a cache file depends on.
+
+    The ctime of a scan changes even when its size and modification time are kept.
+    """
     stats = [os.stat(path) for path in sequence.scan_paths]
     scans = [(s.st_size, s.st_mtime_ns, s.st_ctime_ns) for s in stats]
     depends = str(sequence.folder.resolve()), scans, sequence.intensity_max, settings, dtype.descr
     return hashlib.sha256(repr(depends).encode()).hexdigest()[:16]
 
 
-def _cache_row(task, compute, dtype):
-    """A scan file and its `intensity_max` -> the bytes of its row in a cache file."""
+def _cache_row(task, compute, row_dtype):
+    """(path of a scan, intensity_max) -> the bytes of its row in a cache file."""
     path, intensity_max = task
-    scan, row = read_scan(path, intensity_max), np.zeros((), dtype)
+    scan = read_scan(path, intensity_max)
+    row = np.zeros((), row_dtype)
     row["scan_crc"] = zlib.crc32(scan)
     try:
         row["record"] = compute(scan)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    row["crc"] = zlib.crc32(row.tobytes()[:-4])
+    row["crc"] = zlib.crc32(row.tobytes()[:-4])  # of the row without its last field, the CRC
     return row.tobytes()
 
 
-def _is_intact(file, dtype, n):
-    """Whether a cache file is there, of this dtype and length, and every checksum in it is right. Says so when it is damaged."""
+def _is_intact(file, row_dtype, n):
+    """Whether a cache file exists, holds n rows and has the right checksums.
+
+    Says so on stderr when the file is damaged.
+    """
     if not file.is_file():
         return False
     try:
-        rows = np.load(file, mmap_mode="r")  # pickles are off, so no code runs
-        if rows.dtype == dtype and all(zlib.crc32(row[:-4]) == crc for row, crc in zip(rows.view(np.uint8).reshape(n, -1), rows["crc"])):
-            return True
+        rows = np.load(file, mmap_mode="r")  # pickles are off by default, so no code runs
+        if rows.dtype == row_dtype:
+            content = rows.view(np.uint8).reshape(n, -1)  # (n,bytes of a row)
+            if all(zlib.crc32(row[:-4]) == crc for row, crc in zip(content, rows["crc"])):
+                return True
     except Exception:  # np.load raises many exception types; all of them mean a corrupt file
         pass
-    print(f"{file}: damaged, it is made again", file=sys.stderr)
+    print(f"{file}: damaged, so it is made again", file=sys.stderr)
     return False
 
 
 def fingerprint(sequence, scan_crcs):
-    """16 hex digits that identify the data of a sequence, wherever they lie: the CRC of every scan, and the poses."""
+    """16 hex digits that identify a sequence by its content: the CRC of every scan, and the poses.
+
+    They do not depend on the folder or on file times.
+    """
     poses = b"" if sequence.poses_cam is None else sequence.poses_cam.tobytes()
     return hashlib.sha256(scan_crcs.tobytes() + poses).hexdigest()[:16]
 
 
-# ------------------------------------------------------------------------------ KITTI's raw drives
-# Files and columns: readme.txt of the raw data devkit, and oxts/dataformat.txt of each drive.
-EARTH_RADIUS = 6378137.0  # m, devkit: latlonToMercator.m
-LAT_LON_ALT, ROLL_PITCH_YAW = slice(0, 3), slice(3, 6)  # columns of a packet: degrees, m; radians
-VELOCITY, TURN_RATE = [7, 6, 10], slice(17, 20)  # m/s east, north, up; rad/s around its x, y and z
-NEAR = np.timedelta64(100, "ms")  # without a packet as near as that a scan has no pose
+# ------------------------------------------------------------------------------------------------
+# KITTI's raw drives: readme.txt of the raw data devkit, and oxts/dataformat.txt of each drive
+
+EARTH_RADIUS = 6378137.0  # [m]; devkit: latlonToMercator.m
+# Columns of a GPS/IMU packet
+LAT_LON_ALT = slice(0, 3)  # degrees, degrees, m
+ROLL_PITCH_YAW = slice(3, 6)  # rad
+VELOCITY = [7, 6, 10]  # m/s to the east, to the north and upwards
+TURN_RATE = slice(17, 20)  # rad/s about the unit's x, y and z axes
+MAX_DELAY = np.timedelta64(100, "ms")  # a scan farther from every packet has no pose
+SECOND = np.timedelta64(1, "s")
 
 
 def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int]]:
@@ -615,7 +824,7 @@ def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int
     (number of its first scan in the drive, of its last)}.
 
     A pose is that of the time in velodyne_points/timestamps.txt: the middle of the scanner's turn,
-    when it faces forward and triggers the cameras, which is what the "sync" data is aligned to. The
+    when it faces forward and triggers the cameras. The "sync" data is aligned to this time. The
     GPS/IMU packet of a scan was recorded at another time, 12 to 25 ms later in drive 0013. So the
     nearest packet is moved by its own velocity and turn rate to the time of the scan. The points
     are used as they are: those of a turn were measured over 0.1 s.
@@ -624,31 +833,38 @@ def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int
     one or when ROOT holds such a sequence already. ROOT is then unchanged.
     """
     drive, root = Path(drive), Path(root)
-    name = re.fullmatch(r"((\d{4}_\d\d_\d\d)_drive_\d+)_sync", drive.resolve().name)
-    if not name:
+    match = re.fullmatch(r"((\d{4}_\d\d_\d\d)_drive_\d+)_sync", drive.resolve().name)
+    if not match:
         raise ValueError(f"{drive} is no drive of KITTI's raw data: give a folder such as "
                          "2011_09_26/2011_09_26_drive_0013_sync, of the synced+rectified data.")
-    name, date = name.groups()
-    numbers, scans, times = _raw_stream(drive / "velodyne_points", ".bin", f"{name}_sync.zip")
-    _, packets, packet_times = _raw_stream(drive / "oxts", ".txt", f"{name}_sync.zip")
+    name, date = match.groups()
+    archive = f"{name}_sync.zip"
+    numbers, scans, times = _raw_stream(drive / "velodyne_points", ".bin", archive)
+    _, packets, packet_times = _raw_stream(drive / "oxts", ".txt", archive)
     Tr, T_velo_imu = _raw_calib(drive.resolve().parent, f"{date}_calib.zip")
     for path in scans:
         _check_scan_size(path, path.stat().st_size)
 
-    # the nearest packet of each scan, then the scans in runs without a gap
-    nearest = np.array([np.abs(packet_times - time).argmin() for time in times])
-    late = times - packet_times[nearest]
-    has_pose = np.flatnonzero(np.abs(late) < NEAR)
+    # The nearest packet of each scan
+    nearest = np.array([np.abs(packet_times - t).argmin() for t in times])  # (n,)
+    delay = times - packet_times[nearest]  # (n,)
+    has_pose = np.flatnonzero(np.abs(delay) < MAX_DELAY)
     if not len(has_pose):
         raise ValueError(f"{drive}: no scan was taken within 0.1 s of a GPS/IMU packet; "
-                         f"unpack {name}_sync.zip again.")
-    runs = np.split(has_pose, np.flatnonzero(np.diff(numbers[has_pose]) != 1) + 1)
-    parts = {name if len(runs) == 1 else f"{name}-{i}": run for i, run in enumerate(runs, 1)}
+                         f"unpack {archive} again.")
+
+    # Split the scans at the gaps; each run of consecutive scans becomes a sequence
+    gaps = np.flatnonzero(np.diff(numbers[has_pose]) != 1) + 1
+    runs = np.split(has_pose, gaps)
+    names = [name] if len(runs) == 1 else [f"{name}-{i + 1}" for i in range(len(runs))]
+    parts = dict(zip(names, runs))
+
     packets = np.stack([_read_packet(path) for path in packets])  # (m,30)
-    T_imu = _imu_poses(packets, nearest, late / np.timedelta64(1, "s"))  # (n,4,4)
+    T_imu = _imu_poses(packets, nearest, delay / SECOND)  # (n,4,4)
 
     folders = {part: root / "sequences" / part for part in parts}
-    for path in (*folders.values(), *(root / "poses" / f"{part}.txt" for part in parts)):
+    truths = {part: root / "poses" / f"{part}.txt" for part in parts}
+    for path in (*folders.values(), *truths.values()):
         if path.exists():
             raise ValueError(f"{path} is there already: remove it or choose another ROOT.")
     temporary = {part: temporary_beside(folder) for part, folder in folders.items()}
@@ -656,9 +872,9 @@ def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int
         for part, run in parts.items():
             _write_raw_sequence(temporary[part], [scans[i] for i in run], Tr, times[run])
         for part, run in parts.items():
-            T = invert(T_imu[run[0]]) @ T_imu[run]
+            T = invert(T_imu[run[0]]) @ T_imu[run]  # relative to the first pose
             T_cam = velo_to_camera(T, Tr @ T_velo_imu)  # from the IMU's frame to the camera's
-            write_poses(root / "poses" / f"{part}.txt", T_cam)
+            write_poses(truths[part], T_cam)
             temporary[part].rename(folders[part])
     finally:
         for folder in temporary.values():
@@ -667,8 +883,8 @@ def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int
 
 
 def _write_raw_sequence(folder, scans, Tr, times):
-    """The files of a sequence in odometry layout but its poses."""
-    shutil.rmtree(folder, ignore_errors=True)  # of an earlier process of the same number
+    """Write the scans, calib.txt and times.txt of a sequence in odometry layout."""
+    shutil.rmtree(folder, ignore_errors=True)  # left by an earlier process with the same id
     (folder / "velodyne").mkdir(parents=True)
     for i, scan in enumerate(progress(scans, len(scans), "linking or copying scans")):
         target = folder / "velodyne" / f"{i:06d}.bin"
@@ -676,13 +892,14 @@ def _write_raw_sequence(folder, scans, Tr, times):
             os.link(scan.resolve(), target)
         except OSError:  # another file system, or one without links
             shutil.copyfile(scan, target)
-    seconds = (times - times[0]) / np.timedelta64(1, "s")
-    (folder / "calib.txt").write_text(f"Tr: {' '.join(f'{x:.12e}' for x in Tr[:3].ravel())}\n")
+    row = " ".join(f"{x:.12e}" for x in Tr[:3].ravel())
+    (folder / "calib.txt").write_text(f"Tr: {row}\n")
+    seconds = (times - times[0]) / SECOND
     (folder / "times.txt").write_text("".join(f"{t:.6f}\n" for t in seconds))
 
 
-def _require(path, archive):
-    """Raises FileNotFoundError when a file of KITTI's is missing."""
+def _require_file(path, archive):
+    """FileNotFoundError, naming the archive it is in, when one of KITTI's files is missing."""
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: it is in {archive}.")
 
@@ -695,8 +912,8 @@ def _raw_stream(folder, suffix, archive):
     """
     stamps = folder / "timestamps.txt"
     paths = sorted(path for path in folder.glob(f"data/*{suffix}") if path.stem.isdecimal())
-    _require(stamps, archive)
-    _require(paths[0] if paths else folder / "data" / f"0000000000{suffix}", archive)
+    _require_file(stamps, archive)
+    _require_file(paths[0] if paths else folder / "data" / f"0000000000{suffix}", archive)
     numbers = np.array([int(path.stem) for path in paths])
     try:
         lines = [line.strip() for line in stamps.read_text().splitlines()]
@@ -711,7 +928,7 @@ def _raw_stream(folder, suffix, archive):
 
 
 def _read_packet(path):
-    """A GPS/IMU packet, (30,) numbers in the order of oxts/dataformat.txt."""
+    """A GPS/IMU packet: (30,) numbers in the order of oxts/dataformat.txt."""
     try:
         packet = np.array(path.read_bytes().split(), dtype=float).reshape(30)
     except ValueError:
@@ -726,493 +943,866 @@ def _raw_calib(folder, archive):
     """The calib_*.txt of a date -> Tr (4,4), from Velodyne to rectified camera, and T_velo_imu."""
     def transform(name, rotation, translation=None):
         path = folder / name
-        _require(path, archive)
+        _require_file(path, archive)
+        R = _calib_row(path, rotation, 9).reshape(3, 3)
         t = _calib_row(path, translation, 3) if translation else np.zeros(3)
-        row = np.c_[_calib_row(path, rotation, 9).reshape(3, 3), t]
+        row = np.column_stack([R, t])  # (3,4)
         if not _is_rigid(row):
             raise ValueError(f"{path} is damaged: its row {rotation!r} should hold a rotation, "
                              f"and 'T' a translation; unpack {archive} again.")
-        return np.vstack([row, [0, 0, 0, 1]])
+        return np.vstack([row, [0, 0, 0, 1]])  # (4,4)
+
     rectify = transform("calib_cam_to_cam.txt", "R_rect_00")
-    return (rectify @ transform("calib_velo_to_cam.txt", "R", "T"),
-            transform("calib_imu_to_velo.txt", "R", "T"))
+    T_cam_velo = transform("calib_velo_to_cam.txt", "R", "T")
+    T_velo_imu = transform("calib_imu_to_velo.txt", "R", "T")
+    return rectify @ T_cam_velo, T_velo_imu
 
 
-def _imu_poses(packets, nearest, late):
-    """Poses T_wi (n,4,4) of the GPS/IMU unit (x forward, y left, z up), `late` (n,) seconds after
-    the packets `nearest` (n,) of all (m,30). The world is x east, y north, z up, in metres.
+def _imu_poses(packets, nearest, delay):
+    """Poses T_wi (n,4,4) of the GPS/IMU unit (x forward, y left, z up) at the times of the scans.
+
+    packets (m,30); nearest (n,): the packet nearest to each scan; delay (n,): time from the packet
+    to the scan [s]. The world is x east, y north, z up, in metres.
 
     The pose of a packet is that of the devkit's convertOxtsToPose.m: a Mercator projection with
     the scale of the drive's first latitude, and roll, pitch, yaw about x, y, z in that order.
-    Velocity and turn rate are constant from there: the unit moves along an arc, and the chord of
+    From there, velocity and turn rate are constant: the unit moves along an arc, and the chord of
     the arc has the direction of the velocity half-way.
     """
     scale = EARTH_RADIUS * np.cos(np.radians(packets[0, 0]))
-    packets, late = packets[nearest], late[:, None]
+    packets, delay = packets[nearest], delay[:, None]  # (n,30), (n,1)
     lat, lon, alt = packets[:, LAT_LON_ALT].T
-    east, north = scale * np.radians(lon), scale * np.log(np.tan(np.radians(90 + lat) / 2))
+    east = scale * np.radians(lon)
+    north = scale * np.log(np.tan(np.radians(90 + lat) / 2))
     position = np.stack([east, north, alt], axis=1)  # (n,3)
     attitude = Rotation.from_euler("xyz", packets[:, ROLL_PITCH_YAW])
-    turn = attitude.apply(packets[:, TURN_RATE]) * late  # (n,3) rotation vectors, world's axes
-    half_way = Rotation.from_rotvec(turn / 2)
-    T = np.tile(np.eye(4), (len(packets), 1, 1))
+    turn = attitude.apply(packets[:, TURN_RATE]) * delay  # (n,3) rotation vectors, world's axes
+    half_turn = Rotation.from_rotvec(turn / 2)
+    T = np.tile(np.eye(4), (len(packets), 1, 1))  # (n,4,4)
     T[:, :3, :3] = (Rotation.from_rotvec(turn) * attitude).as_matrix()
-    T[:, :3, 3] = position + half_way.apply(packets[:, VELOCITY] * late)
+    T[:, :3, 3] = position + half_turn.apply(packets[:, VELOCITY] * delay)
     return T
 
 
-# ---------------------------------------------------------------------------------------------------- the simulated city
-# The world is vertical prisms on a ground, one row each: yawed boxes and upright cylinders. It is flat, and hills bend it afterwards.
-# In m and radians; FUZZ is the depth [m] to which foliage lets light in, ROUND is 1 for a cylinder.
-X, Y, YAW, HALF_X, HALF_Y, Z0, Z1, ALBEDO, FUZZ, ROUND = range(10)
-CITY = 3  # one more when the city changes, so that scans of two versions are never mixed
-ELEVATION = np.radians(np.r_[np.linspace(-24.33, -8.83, 32), np.linspace(-8.33, 2.0, 32)])  # the HDL-64E's 64 beams, bottom to top
-SENSOR_HEIGHT, MIN_RANGE, CITY_RANGE = 1.73, 2.5, 80.0  # m
-LANE = 3.5  # m; we keep to the right lane of two, so the road reaches from 1.75 m right to 5.25 m left of our path
-CELL = 0.5  # m, of the ground's raster
-RELIEF = 0.4  # m, depth of windows and doors in what is higher than 3 m
-# what a sequence is like: cruising speed [m/s], odds of a street corner every 35-80 m (faster: further), stops, and
-# odds of (dense, suburban, open) surroundings
-STYLES = {"00": (12, 0.55, 0, (6, 3, 1)), "01": (26, 0.15, 0, (1, 3, 12)), "02": (15, 0.4, 0, (1, 6, 2)), "08": (12, 0.5, 1, (4, 4, 1)),
-          "09": (19, 0.3, 0, (1, 3, 5)), "03": (10, 0.5, 0, (2, 5, 2)), "04": (18.5, 0.2, 0, (3, 3, 3)), "05": (12, 0.55, 1, (6, 3, 1)),
-          "06": (16, 0.4, 0, (3, 5, 1)), "10": (13, 0.5, 1, (2, 4, 3)), "07": (12, 0.5, 1, (6, 3, 1))}
+# ------------------------------------------------------------------------------------------------
+# The simulated city
+#
+# The world consists of vertical prisms, boxes and upright cylinders, on a raster of the ground. It
+# is built on flat land; hills are added to the finished points. Units are metres and radians, the
+# frame is x east, y north, z up. A prism is a row of 10 numbers:
+
+X, Y = 0, 1  # centre
+YAW = 2  # heading of its x axis
+HALF_X, HALF_Y = 3, 4  # half of its size along its own axes; the radius of a cylinder
+Z0, Z1 = 5, 6  # height of its bottom and its top
+ALBEDO = 7
+FUZZ = 8  # depth to which foliage lets light in; 0 for a solid
+ROUND = 9  # 1 for a cylinder, 0 for a box
+
+CITY = 3  # version; increase it when the city changes, so that scans of two are never mixed
+# Elevation of the 64 beams of an HDL-64E, from the lowest to the highest
+ELEVATION = np.radians(np.r_[np.linspace(-24.33, -8.83, 32), np.linspace(-8.33, 2.0, 32)])
+SENSOR_HEIGHT, MIN_RANGE, CITY_RANGE = 1.73, 2.5, 80.0
+LANE = 3.5  # width; the road has two lanes, and we drive in the middle of the right one
+CELL = 0.5  # size of a cell of the ground
+RELIEF = 0.4  # depth of windows and doors, in prisms higher than 3 m
+DENSE, SUBURBAN, OPEN = 0, 1, 2  # surroundings
+
+
+class _Style(NamedTuple):
+    """How a sequence drives, and through which surroundings."""
+
+    cruise: float  # cruising speed [m/s]
+    corners: float  # probability of a street corner every 35 to 80 m; farther apart above 15 m/s
+    stops: int  # number of times it comes to a halt
+    odds: tuple  # of dense, suburban and open surroundings
+
+
+STYLES = {
+    "00": _Style(12, 0.55, 0, (6, 3, 1)),
+    "01": _Style(26, 0.15, 0, (1, 3, 12)),
+    "02": _Style(15, 0.4, 0, (1, 6, 2)),
+    "03": _Style(10, 0.5, 0, (2, 5, 2)),
+    "04": _Style(18.5, 0.2, 0, (3, 3, 3)),
+    "05": _Style(12, 0.55, 1, (6, 3, 1)),
+    "06": _Style(16, 0.4, 0, (3, 5, 1)),
+    "07": _Style(12, 0.5, 1, (6, 3, 1)),
+    "08": _Style(12, 0.5, 1, (4, 4, 1)),
+    "09": _Style(19, 0.3, 0, (1, 3, 5)),
+    "10": _Style(13, 0.5, 1, (2, 4, 3)),
+}
+
+# The drive
 
 
 def _drive(rng, scans, style):
-    """A road and a drive on it -> at(s, left=0): x, y, heading at `s` metres along the road; s_of(t): metres at t [s]; its length [m]."""
-    cruise, corners, stops, _ = style
-    ds, start, length = 0.25, 100.0, 100 + 0.13 * cruise * scans + 150  # m; road before and behind us for what we see there
-    pieces = []  # length [m], curvature [1/m], speed [m/s]: straight ahead, a bend, perhaps a street corner
+    """Draw a road and a drive along it.
+
+    Returns position(s, left=0) -> x, y, heading at s metres along the road and `left` metres to its
+    left; distance(t) -> metres driven after t seconds; and the length of the road.
+    """
+    ds = 0.25  # step along the road
+    start = 100.0  # the drive starts here, so there is road behind it as well
+    length = 100 + 0.13 * style.cruise * scans + 150
+    pieces = []  # (length, curvature [1/m], speed [m/s])
     while sum(piece[0] for piece in pieces) < length:
-        stretch, speed = rng.uniform(35, 80) * max(cruise / 15, 1) ** 2, cruise * rng.uniform(0.75, 1.0)
-        bend = rng.choice([-1, 1]) * rng.choice([0.0, rng.uniform(1.0, 2.8)]) / speed ** 2  # up to 2.8 m/s2 sideways
-        arc = min(rng.uniform(0.5, 0.8) * stretch, np.radians(60) / max(abs(bend), 1e-6))
-        radius, angle = rng.choice([-1, 1]) * rng.uniform(7, 12), np.radians(rng.uniform(70, 100)) * (rng.random() < corners)
-        pieces += [(stretch - arc, 0.0, speed), (arc, bend, speed), (abs(radius) * angle, 1 / radius, speed)]
-    metres, curvature, limit = np.array(pieces).T
-    curvature, limit = (np.repeat(x, np.round(metres / ds).astype(int)) for x in (curvature, limit))
-    smooth = lambda x, metres: gaussian_filter(x, metres / ds, mode="nearest")
-    k = smooth(curvature, 1.7) + smooth(rng.normal(0, 0.01, len(curvature)), 8)  # nobody turns the wheel at once, or holds it still
+        pieces += _pieces_of_road(rng, style)
+    metres, curvature, speed = np.array(pieces).T
+    repeats = np.round(metres / ds).astype(int)
+    curvature, speed = np.repeat(curvature, repeats), np.repeat(speed, repeats)
+
+    def smooth(values, metres):
+        return gaussian_filter(values, metres / ds, mode="nearest")
+
+    # The steering wheel turns gradually and is never quite still
+    wobble = rng.normal(0, 0.01, len(curvature))
+    k = smooth(curvature, 1.7) + smooth(wobble, 8)
     s = np.arange(len(k)) * ds
-    v = np.minimum(limit, np.sqrt(rng.uniform(2.8, 3.6) / np.maximum(np.abs(k), 1e-4)))
-    halts = start + 0.07 * cruise * scans * rng.uniform(0.2, 1, stops)
-    for h in halts:
-        v[abs(s - h) < 1] = 0.4
-    for order in (range(1, len(v)), range(len(v) - 2, -1, -1)):  # speeding up takes room, and so does braking: 2.2 m/s2
-        for i in order:
-            v[i] = min(v[i], np.sqrt(v[i - order.step] ** 2 + 2 * 2.2 * ds))
+
+    # Speed: limited by the piece of road, the lateral acceleration in bends, and halts
+    lateral = rng.uniform(2.8, 3.6)  # [m/s2]
+    v = np.minimum(speed, np.sqrt(lateral / np.maximum(np.abs(k), 1e-4)))
+    halts = start + 0.07 * style.cruise * scans * rng.uniform(0.2, 1, style.stops)
+    for halt in halts:
+        v[abs(s - halt) < 1] = 0.4
+    # Limit acceleration (forward pass) and braking (backward pass) to 2.2 m/s2
+    gain = 2 * 2.2 * ds  # largest change of v^2 in a step
+    for i in range(1, len(v)):
+        v[i] = min(v[i], np.sqrt(v[i - 1]**2 + gain))
+    for i in range(len(v) - 2, -1, -1):
+        v[i] = min(v[i], np.sqrt(v[i + 1]**2 + gain))
+
     t = np.r_[0, np.cumsum(ds / smooth(v, 1.0))[:-1]]
-    for h in halts:
-        t[s > h] += rng.uniform(0.5, 2.0)  # standing
+    for halt in halts:
+        t[s > halt] += rng.uniform(0.5, 2.0)  # standing still
     t -= np.interp(start, s, t)
     heading = np.cumsum(k) * ds
-    x, y = np.cumsum(np.cos(heading)) * ds, np.cumsum(np.sin(heading)) * ds
+    x = np.cumsum(np.cos(heading)) * ds
+    y = np.cumsum(np.sin(heading)) * ds
 
-    def at(q, left=0.0):
-        h = np.interp(q, s, heading)
-        return np.interp(q, s, x) - left * np.sin(h), np.interp(q, s, y) + left * np.cos(h), h
-    return at, lambda q: np.interp(q, t, s), s[-1]
+    def position(at, left=0.0):
+        angle = np.interp(at, s, heading)
+        x_left = np.interp(at, s, x) - left * np.sin(angle)
+        y_left = np.interp(at, s, y) + left * np.cos(angle)
+        return x_left, y_left, angle
+
+    def distance(at):
+        return np.interp(at, t, s)
+
+    return position, distance, s[-1]
 
 
-def _ego(rng, at, s_of, scans):
-    """The Velodyne's poses T_wt (scans,4,4): it follows the road and its car leans, nods and shakes."""
-    t = np.arange(scans) * 0.1
-    wave = lambda size, low, high: sum(size / 2 * np.sin(2 * np.pi * rng.uniform(low, high) * t + rng.uniform(0, 6.3)) for _ in range(5))
-    s = np.array([s_of(t + d) for d in (-0.2, 0, 0.2)])
-    speed, push = (s[2] - s[0]) / 0.4, (s[2] - 2 * s[1] + s[0]) / 0.04  # m/s, m/s2
-    x, y, yaw = at(s[1])
-    lean = speed * (at(s[2])[2] - at(s[0])[2]) / 0.4  # m/s2 sideways
-    shake = np.minimum(speed / 8, 1)  # nothing shakes when we stand
-    roll = np.radians(0.25 * lean + shake * (wave(0.25, 0.2, 0.8) + wave(0.12, 1, 2.5)))
-    pitch = np.radians(-0.2 * gaussian_filter(push, 2) + shake * (wave(0.25, 0.2, 0.8) + wave(0.14, 1, 2.5)))
+def _pieces_of_road(rng, style):
+    """Draw a straight piece, a bend and perhaps a street corner: (length, curvature, speed) each.
+
+    The bend may be straight, too. A corner that is not there has the length 0.
+    """
+    stretch = rng.uniform(35, 80) * max(style.cruise / 15, 1) ** 2
+    speed = style.cruise * rng.uniform(0.75, 1.0)
+    side = rng.choice([-1, 1])
+    lateral = rng.choice([0.0, rng.uniform(1.0, 2.8)])  # acceleration in the bend [m/s2]
+    bend = side * lateral / speed**2  # [1/m]
+    # A bend turns by 60 degrees at most
+    arc = min(rng.uniform(0.5, 0.8) * stretch, np.radians(60) / max(abs(bend), 1e-6))
+    radius = rng.choice([-1, 1]) * rng.uniform(7, 12)
+    angle = np.radians(rng.uniform(70, 100))
+    if rng.random() >= style.corners:
+        angle = 0.0
+    return [(stretch - arc, 0.0, speed), (arc, bend, speed),
+            (abs(radius) * angle, 1 / radius, speed)]
+
+
+def _sensor_poses(rng, position, distance, scans):
+    """Poses T_wt (scans,4,4) of the Velodyne on the flat world.
+
+    The car follows the road. It leans in bends, pitches when it brakes, and shakes.
+    """
+    t = np.arange(scans) * 0.1  # [s]
+
+    def wave(size, low, high):
+        """The sum of 5 waves of random frequencies from `low` to `high` Hz."""
+        total = 0
+        for _ in range(5):
+            frequency, phase = rng.uniform(low, high), rng.uniform(0, 6.3)
+            total = total + size / 2 * np.sin(2 * np.pi * frequency * t + phase)
+        return total
+
+    # Speed and acceleration from the distances 0.2 s before, now and 0.2 s after
+    before, s, after = (distance(t + dt) for dt in (-0.2, 0, 0.2))
+    speed = (after - before) / 0.4  # [m/s]
+    acceleration = (after - 2 * s + before) / 0.04  # [m/s2]
+    x, y, yaw = position(s)
+    lateral = speed * (position(after)[2] - position(before)[2]) / 0.4  # acceleration [m/s2]
+
+    shake = np.minimum(speed / 8, 1)  # a car at rest does not shake
+    shake_roll = shake * (wave(0.25, 0.2, 0.8) + wave(0.12, 1, 2.5))
+    shake_pitch = shake * (wave(0.25, 0.2, 0.8) + wave(0.14, 1, 2.5))
+    shake_z = shake * wave(0.015, 0.3, 1.5)
+    roll = np.radians(0.25 * lateral + shake_roll)
+    pitch = np.radians(-0.2 * gaussian_filter(acceleration, 2) + shake_pitch)
+
     T = np.tile(np.eye(4), (scans, 1, 1))
-    T[:, :3, :3] = Rotation.from_euler("xyz", np.stack([roll, pitch, yaw], axis=1)).as_matrix()
-    ahead = 0.8  # m: the Velodyne sits before the rear axle, which is what follows the road, so a turn also pushes it sideways
-    T[:, :3, 3] = np.stack([x + ahead * np.cos(yaw), y + ahead * np.sin(yaw), SENSOR_HEIGHT + shake * wave(0.015, 0.3, 1.5)], axis=1)
+    angles = np.stack([roll, pitch, yaw], axis=1)
+    T[:, :3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
+    # The rear axle follows the road. The Velodyne is ahead of it, so turns also move it sideways.
+    ahead = 0.8
+    T[:, 0, 3] = x + ahead * np.cos(yaw)
+    T[:, 1, 3] = y + ahead * np.sin(yaw)
+    T[:, 2, 3] = SENSOR_HEIGHT + shake_z
     return T
 
 
 def _hills(rng, T):
-    """The land: height(x, y) [m], the sum of waves 80 to 400 m long, slopes of some 3 % (rms). Then the poses T_wt (n,4,4) of the flat
-    world upon it: lifted, and tilted with the slope."""
-    k = 2 * np.pi / np.geomspace(80, 400, 6)  # rad/m
-    way, phase = rng.uniform(0, 2 * np.pi, (2, 6))
-    waves = np.stack([k * np.cos(way), k * np.sin(way), phase, 0.017 / k], axis=1).tolist()
-    height = lambda x, y: sum(size * np.sin(kx * x + ky * y + phase) for kx, ky, phase, size in waves)
+    """Draw the hills: height(x, y), and the poses T_wt (n,4,4) of the flat world moved onto them.
+
+    The height is a sum of waves 80 to 400 m long, with a slope of some 3 % (root mean square). A
+    pose is lifted to the height of the land and tilted with its slope.
+    """
+    k = 2 * np.pi / np.geomspace(80, 400, 6)  # wave numbers [rad/m]
+    direction, phase = rng.uniform(0, 2 * np.pi, (2, 6))
+    kx, ky = k * np.cos(direction), k * np.sin(direction)
+    waves = np.stack([kx, ky, phase, 0.017 / k], axis=1).tolist()
+
+    def height(x, y):
+        return sum(size * np.sin(kx * x + ky * y + phase) for kx, ky, phase, size in waves)
+
     x, y, d = T[:, 0, 3], T[:, 1, 3], 0.5
-    slope = np.stack([height(x, y + d) - height(x, y - d), height(x - d, y) - height(x + d, y), 0 * x], axis=1) / (2 * d)
+    slope_x = (height(x + d, y) - height(x - d, y)) / (2 * d)
+    slope_y = (height(x, y + d) - height(x, y - d)) / (2 * d)
+    tilt = np.stack([slope_y, -slope_x, 0 * x], axis=1)  # (n,3) rotation vectors
     T_hills = T.copy()
-    T_hills[:, :3, :3] = Rotation.from_rotvec(slope).as_matrix() @ T[:, :3, :3]
+    T_hills[:, :3, :3] = Rotation.from_rotvec(tilt).as_matrix() @ T[:, :3, :3]
     T_hills[:, 2, 3] += height(x, y)
     return height, T_hills
 
 
-def _rows(*columns):
-    return np.stack(np.broadcast_arrays(*[np.asarray(c, dtype=float) for c in columns]), axis=-1).reshape(-1, 10)
+# Houses, cars and plants along the road
+
+
+def _prisms(*columns):
+    """The 10 columns of prisms, numbers or arrays (n,) -> (n,10)."""
+    arrays = [np.asarray(column, dtype=float) for column in columns]
+    return np.stack(np.broadcast_arrays(*arrays), axis=-1).reshape(-1, 10)
 
 
 def _cars(x, y, yaw, looks):
-    """Cars (n,) -> (2n,10) prisms: a body one can look under, and a cabin of which the windows return little."""
+    """Positions, headings and `_car_looks` of n cars -> prisms (2n,10).
+
+    A car is a body with a gap below it, and a cabin whose windows return little light.
+    """
     length, height, albedo = looks
-    waist, back = np.where(height > 1.9, 0.5 * height, 0.9), 0.08 * length
-    body = _rows(x, y, yaw, length / 2, 0.88, 0.25, waist, albedo, 0, 0)
+    waist = np.where(height > 1.9, 0.5 * height, 0.9)
+    body = _prisms(x, y, yaw, length / 2, 0.88, 0.25, waist, albedo, 0, 0)
+    back = 0.08 * length  # the cabin is behind the middle of the body
     x, y = x - back * np.cos(yaw), y - back * np.sin(yaw)
-    return np.concatenate([body, _rows(x, y, yaw, 0.29 * length, 0.78, waist, height, 0.6 * albedo, 0, 0)])
+    cabin = _prisms(x, y, yaw, 0.29 * length, 0.78, waist, height, 0.6 * albedo, 0, 0)
+    return np.concatenate([body, cabin])
 
 
-def _looks(rng, n=None):
-    """Length [m], height [m], albedo of n cars (3,n): an eighth are vans, many are dark."""
+def _car_looks(rng, n=None):
+    """Draw length, height and albedo of n cars (3,n). One in eight is a van; many are dark."""
     van = rng.random(n) < 0.12
-    return np.stack([np.where(van, rng.uniform(5, 6.5, n), rng.uniform(3.6, 4.8, n)),
-                     np.where(van, rng.uniform(2, 2.8, n), rng.uniform(1.4, 1.6, n)), 0.02 + 0.5 * rng.random(n) ** 2])
+    van_length, car_length = rng.uniform(5, 6.5, n), rng.uniform(3.6, 4.8, n)
+    van_height, car_height = rng.uniform(2, 2.8, n), rng.uniform(1.4, 1.6, n)
+    albedo = 0.02 + 0.5 * rng.random(n) ** 2
+    return np.stack([np.where(van, van_length, car_length), np.where(van, van_height, car_height),
+                     albedo])
 
 
 class _Street:
-    """What stands on one side of a road of `length` m: `out` collects prisms, `zone(s)` is 0 dense, 1 suburban, 2 open at s metres."""
+    """One side of a road of `length` metres: its prisms are collected in the list `out`.
 
-    def __init__(self, rng, at, length, side, edge, zones):
-        self.rng, self.at, self.length, self.out = rng, at, length, []
-        self.side, self.edge, self.zone = side, edge, lambda s: zones[int(s / 70)]  # side: 1 left, -1 right; edge [m] of the road
+    side: 1 for the left side, -1 for the right; edge: distance from our path to the edge of the
+    road; zones: the surroundings of every 70 m. Random numbers are drawn in a fixed order, since
+    the same seed must always give the same city.
+    """
 
-    def put(self, s, left, half_x, half_y, z0, z1, albedo, fuzz=0.0, round_=0, twist=0.0):
-        x, y, yaw = self.at(s, left)
-        self.out.append(_rows(x, y, yaw + twist, half_x, half_y, z0, z1, albedo, fuzz, round_))
+    def __init__(self, rng, position, length, side, edge, zones):
+        self.rng, self.position, self.length = rng, position, length
+        self.side, self.edge, self.zones = side, edge, zones
+        self.out = []
+
+    def zone(self, s):
+        """DENSE, SUBURBAN or OPEN at s metres."""
+        return self.zones[int(s / 70)]
+
+    def put(self, s, left, half_x, half_y, z0, z1, albedo, fuzz=0.0, twist=0.0):
+        """A box at s metres along the road and `left` metres to its left."""
+        x, y, yaw = self.position(s, left)
+        self.out.append(_prisms(x, y, yaw + twist, half_x, half_y, z0, z1, albedo, fuzz, 0))
+
+    def put_round(self, s, left, radius, z0, z1, albedo, fuzz=0.0):
+        """A cylinder."""
+        x, y, yaw = self.position(s, left)
+        self.out.append(_prisms(x, y, yaw, radius, radius, z0, z1, albedo, fuzz, 1))
 
     def tree(self, s, left):
+        """A trunk and a crown."""
         u = self.rng.uniform
-        radius, crown = u(0.1, 0.3), u(1.2, 3.2)
-        self.put(s, left, radius, radius, 0, crown + 1, u(0.15, 0.35), round_=1)
-        self.put(s, left, r := u(1.2, 3.5), r, crown, crown + u(3, 7), u(0.2, 0.45), fuzz=u(0.5, 2.5), round_=1)
+        trunk, crown = u(0.1, 0.3), u(1.2, 3.2)  # radius of the trunk; where the crown begins
+        self.put_round(s, left, trunk, z0=0, z1=crown + 1, albedo=u(0.15, 0.35))
+        self.put_round(s, left, radius=u(1.2, 3.5), z0=crown, z1=crown + u(3, 7),
+                       albedo=u(0.2, 0.45), fuzz=u(0.5, 2.5))
 
     def plots(self):
         """Houses and gardens, one plot after the other."""
-        rng, u, put, side, edge, s = self.rng, self.rng.uniform, self.put, self.side, self.edge, 0.0
+        rng, u, s = self.rng, self.rng.uniform, 0.0
         while s < self.length:
             kind = self.zone(s)
-            plot = u(9, 22) if kind == 0 else u(9, 16)
-            back = edge + (u(3.5, 7) if kind == 0 else u(6, 14) if kind == 1 else u(8, 30))  # where the facade is
-            mid, shade, depth = s + plot / 2, u(0.2, 0.42), u(7, 13)
+            plot = u(9, 22) if kind == DENSE else u(9, 16)  # its length along the road
+            setback = u(*((3.5, 7), (6, 14), (8, 30))[kind])
+            facade = self.edge + setback
+            middle, albedo, depth = s + plot / 2, u(0.2, 0.42), u(7, 13)
             if rng.random() < (0.95, 0.8, 0.3)[kind]:
-                put(mid, side * (back + depth / 2), plot / 2, depth / 2, 0, u(5, 14), shade, twist=rng.normal() * 0.02)
-                for _ in range(rng.integers(2, 6)):  # bays, stairs, porches: without relief a street looks the same from metre to metre
-                    along, out_by = mid + u(-0.45, 0.45) * plot, u(0.1, 0.5)
-                    put(along, side * (back - out_by), u(0.3, 1.5), out_by, 0, u(1, 7), shade * u(0.7, 1.3))
-            if kind and rng.random() < 0.65:  # the border of the plot: a hedge, a wall or a fence
-                thick, fuzz = (0.35, 0.25) if rng.random() < 0.6 else (0.1, 0)
-                put(mid, side * (edge + u(2.2, 3.2)), plot * u(0.3, 0.48), thick, 0, u(0.6, 1.9), u(0.2, 0.4), fuzz)
-            for _ in range(rng.poisson((0.6, 2, 2)[kind])):  # trees and bushes of the garden
-                self.tree(s + u(0, 1) * plot, side * u(edge + 3, back + 3))
-                put(s + u(0, 1) * plot, side * (edge + u(3, 7)), r := u(0.4, 1.2), r, 0, u(0.5, 1.8), u(0.2, 0.4), fuzz=0.25, round_=1)
-            s += plot + (u(5, 14) if kind or rng.random() < 0.35 else u(0, 1))  # a gap, at times a side street
+                self.house(middle, plot, facade, depth, albedo)
+            if kind != DENSE and rng.random() < 0.65:
+                self.border(middle, plot)
+            for _ in range(rng.poisson((0.6, 2, 2)[kind])):
+                self.plants(s, plot, facade)
+            # A gap to the next plot; some are side streets
+            wide = kind != DENSE or rng.random() < 0.35
+            s += plot + (u(5, 14) if wide else u(0, 1))
+
+    def house(self, middle, plot, facade, depth, albedo):
+        """A house with bays, stairs and porches, without which all of a facade looks the same."""
+        rng, u, side = self.rng, self.rng.uniform, self.side
+        self.put(middle, side * (facade + depth / 2), plot / 2, depth / 2, z0=0, z1=u(5, 14),
+                 albedo=albedo, twist=rng.normal() * 0.02)
+        for _ in range(rng.integers(2, 6)):
+            s, out_by = middle + u(-0.45, 0.45) * plot, u(0.1, 0.5)
+            self.put(s, side * (facade - out_by), u(0.3, 1.5), out_by, z0=0, z1=u(1, 7),
+                     albedo=albedo * u(0.7, 1.3))
+
+    def border(self, middle, plot):
+        """A hedge, a wall or a fence between a plot and the road."""
+        u = self.rng.uniform
+        hedge = self.rng.random() < 0.6
+        thick, fuzz = (0.35, 0.25) if hedge else (0.1, 0)
+        self.put(middle, self.side * (self.edge + u(2.2, 3.2)), plot * u(0.3, 0.48), thick, z0=0,
+                 z1=u(0.6, 1.9), albedo=u(0.2, 0.4), fuzz=fuzz)
+
+    def plants(self, s, plot, facade):
+        """A tree and a bush in a garden."""
+        u, side, edge = self.rng.uniform, self.side, self.edge
+        self.tree(s + u(0, 1) * plot, side * u(edge + 3, facade + 3))
+        self.put_round(s + u(0, 1) * plot, side * (edge + u(3, 7)), radius=u(0.4, 1.2), z0=0,
+                       z1=u(0.5, 1.8), albedo=u(0.2, 0.4), fuzz=0.25)
 
     def parked_cars(self):
+        """Cars along the edge of the road."""
         rng, s = self.rng, 0.0
         while s < self.length:
-            looks = _looks(rng)
+            looks = _car_looks(rng)
             if rng.random() < (0.55, 0.35, 0.06)[self.zone(s)]:
-                x, y, yaw = self.at(s, self.side * (self.edge + rng.uniform(1.0, 1.3)))
+                x, y, yaw = self.position(s, self.side * (self.edge + rng.uniform(1.0, 1.3)))
                 self.out.append(_cars(x, y, yaw + rng.normal() * 0.03, looks))
             s += looks[0] + rng.uniform(0.6, 3)
 
     def pavement(self):
-        """Trees, lamps, signs and boxes."""
+        """Trees, poles of lamps and signs, and boxes on the pavement."""
         rng, u, side, edge, s = self.rng, self.rng.uniform, self.side, self.edge, 0.0
         while s < self.length:
-            what = rng.random()
-            if what < 0.35:
+            choice = rng.random()
+            if choice < 0.35:
                 self.tree(s, side * (edge + u(2.2, 3)))
-            elif what < 0.7:
-                self.put(s, side * (edge + u(0.5, 2.5)), r := u(0.04, 0.12), r, 0, u(2.5, 8), u(0.2, 0.6), round_=1)
-            elif what < 0.9:
-                self.put(s, side * (edge + u(2.2, 3)), u(0.2, 0.6), u(0.2, 0.4), 0, u(0.7, 1.7), u(0.1, 0.6))
+            elif choice < 0.7:
+                self.put_round(s, side * (edge + u(0.5, 2.5)), radius=u(0.04, 0.12), z0=0,
+                               z1=u(2.5, 8), albedo=u(0.2, 0.6))
+            elif choice < 0.9:
+                self.put(s, side * (edge + u(2.2, 3)), u(0.2, 0.6), u(0.2, 0.4), z0=0,
+                         z1=u(0.7, 1.7), albedo=u(0.1, 0.6))
             s += u(3, 14)
 
-    def distance(self):
-        """What one sees between the houses, on both sides."""
+    def background(self):
+        """Houses, trees and thickets 12 to 75 m away, seen between the plots. On both sides."""
         rng, u = self.rng, self.rng.uniform
         for _ in range(int(self.length / 2)):
             s, left, house = u(0, self.length), rng.choice([-1, 1]) * u(12, 75), rng.random() < 0.3
             if house:
-                self.put(s, left, u(4, 12), u(4, 8), 0, u(4, 12), u(0.2, 0.4), twist=rng.normal() * 0.3)
+                self.put(s, left, u(4, 12), u(4, 8), z0=0, z1=u(4, 12), albedo=u(0.2, 0.4),
+                         twist=rng.normal() * 0.3)
             elif rng.random() < 0.4:
                 self.tree(s, left)
-            else:  # a thicket, the edge of a wood
-                self.put(s, left, u(1, 8), u(1, 4), 0, u(1, 8), u(0.2, 0.45), fuzz=u(1, 4), twist=rng.normal() * 0.5)
+            else:  # a thicket or the edge of a wood
+                self.put(s, left, u(1, 8), u(1, 4), z0=0, z1=u(1, 8), albedo=u(0.2, 0.45),
+                         fuzz=u(1, 4), twist=rng.normal() * 0.5)
 
 
-def _roadside(rng, at, length, odds):
-    """Everything that stands along a road of `length` m -> (n,10) prisms; what would stand on the road is taken away again."""
-    zones = rng.choice(3, p=np.array(odds) / sum(odds), size=(2, int(length / 70) + 1))
-    left, right = (_Street(rng, at, length, side, edge, zones[(side + 1) // 2]) for side, edge in ((1, 1.5 * LANE), (-1, 0.5 * LANE)))
+def _roadside(rng, position, length, odds):
+    """Draw everything that stands along a road of `length` metres -> prisms (n,10)."""
+    shares = np.array(odds) / sum(odds)
+    zones_right, zones_left = rng.choice(3, p=shares, size=(2, int(length / 70) + 1))
+    left = _Street(rng, position, length, 1, 1.5 * LANE, zones_left)
+    right = _Street(rng, position, length, -1, 0.5 * LANE, zones_right)
     for street in left, right:
         street.plots()
         street.parked_cars()
         street.pavement()
-    right.distance()
-    out = np.concatenate(left.out + right.out)
-    lanes = np.concatenate([np.stack(at(np.arange(0, length, 1.0), left)[:2]) for left in (0, LANE)], axis=1)  # (2,m)
-    x, y, yaw, half_x, half_y = out[:, [X, Y, YAW, HALF_X, HALF_Y]].T[:, :, None]  # (n,1) each
+    right.background()
+    prisms = np.concatenate(left.out + right.out)
+
+    # Points in the middle of the two lanes
+    s = np.arange(0, length, 1.0)
+    lanes = np.concatenate([np.stack(position(s, left)[:2]) for left in (0, LANE)], axis=1)  # (2,m)
+
+    # Remove prisms on the road: those whose gap to such a point is too small, unless they are
+    # higher than a car, as the crowns of trees are
+    columns = prisms[:, [X, Y, YAW, HALF_X, HALF_Y]]
+    x, y, yaw, half_x, half_y = columns.T[:, :, None]  # (n,1) each
     dx, dy, c, s = lanes[0] - x, lanes[1] - y, np.cos(yaw), np.sin(yaw)
-    gap = np.hypot(np.maximum(np.abs(c * dx + s * dy) - half_x, 0), np.maximum(np.abs(c * dy - s * dx) - half_y, 0))  # (n,m) [m]
-    return out[(gap.min(axis=1) > 1.7) | (out[:, Z0] > 2.2)]  # crowns may reach over the road
+    gap_x = np.maximum(np.abs(c * dx + s * dy) - half_x, 0)  # (n,m), along the prism's own axes
+    gap_y = np.maximum(np.abs(c * dy - s * dx) - half_y, 0)  # (n,m)
+    gap = np.hypot(gap_x, gap_y).min(axis=1)  # (n,)
+    return prisms[(gap > 1.7) | (prisms[:, Z0] > 2.2)]
 
 
-def _ground(rng, at, length):
-    """A raster of the ground: height [m] and albedo of every CELL, and the corner (2,) it starts at. Road, kerb, pavement, rough grass."""
-    x, y, _ = at(np.arange(0, length, CELL / 2), LANE / 2)
+def _ground(rng, position, length):
+    """Draw the ground: road, kerb, pavement and rough grass.
+
+    Returns the height and the albedo of every cell, and the corner (2,) of the raster.
+    """
+    x, y, _ = position(np.arange(0, length, CELL / 2), LANE / 2)  # the middle of the road
     corner = np.array([x.min(), y.min()]) - CITY_RANGE - 5
     i, j = ((np.stack([x, y]) - corner[:, None]) / CELL).astype(int)
-    off = np.ones((i.max() + int(90 / CELL), j.max() + int(90 / CELL)), bool)
-    off[i, j] = False
-    away = distance_transform_edt(off).astype(np.float32) * CELL  # m from the middle of the road
-    noise = gaussian_filter(rng.standard_normal(off.shape, dtype=np.float32), 8) * 28  # about N(0,1), 4 m wide
-    paved, grass = away > LANE, np.clip((away - LANE - 2.5) / 6, 0, 1)
-    height = 0.12 * paved + grass * np.clip(0.15 + 0.2 * noise, 0, 0.6)
-    return height.astype(np.float32), (0.33 + 0.03 * paved + 0.03 * noise - 0.04 * grass).astype(np.float32), corner
+    margin = int(90 / CELL)
+    off_road = np.ones((i.max() + margin, j.max() + margin), bool)
+    off_road[i, j] = False
+    away = distance_transform_edt(off_road).astype(np.float32) * CELL  # from the middle of the road
+    # Noise of standard deviation 1, about 4 m wide
+    noise = gaussian_filter(rng.standard_normal(off_road.shape, dtype=np.float32), 8) * 28
+    paved = away > LANE
+    grass = np.clip((away - LANE - 2.5) / 6, 0, 1)  # from 0 on the pavement to 1
+    height = np.where(paved, 0.12, 0) + grass * np.clip(0.15 + 0.2 * noise, 0, 0.6)
+    albedo = 0.33 + np.where(paved, 0.03, 0) + 0.03 * noise - 0.04 * grass
+    return height.astype(np.float32), albedo.astype(np.float32), corner
+
+
+class _World(NamedTuple):
+    """Everything about a sequence but the sensor."""
+
+    T: np.ndarray  # (scans,4,4) poses T_wt of the Velodyne
+    T_flat: np.ndarray  # (scans,4,4) the same before the hills were added
+    prisms: np.ndarray  # (n,10) everything that stands still
+    moving: Callable  # scan i -> prisms (m,10) of the cars on the road
+    ground: tuple  # height and albedo of every cell, corner of the raster
+    height: Callable  # x, y -> height of the hills
 
 
 @functools.lru_cache(maxsize=1)
 def _world(name, seed, scans):
-    """Everything about one sequence but the sensor: T_wt (scans,4,4) and the same before the hills, prisms (n,10), moving(i) -> prisms of
-    scan i, the ground, the hills."""
+    """Draw the `_World` of a sequence.
+
+    The random numbers depend on its name, so it does not matter which others are made with it.
+    """
     style = STYLES.get(name, STYLES["00"])
-    rng = np.random.default_rng([seed, zlib.crc32(name.encode())])  # of the name, so that a subset of sequences gives the same files
-    t = np.arange(scans + 1) * 0.1
-    for _ in range(1000):  # draw again until it is fast and winding enough: 100 m segments, and rotation to get wrong in them
-        at, s_of, length = _drive(rng, scans, style)
-        s = s_of(t)
-        turn = np.degrees(np.diff(at(s)[2]))
-        (x, y, yaw), (x1, y1, _) = (at(s[s <= max(s[-1] - 100, s[0])] + ahead) for ahead in (0, 100))
-        astray = np.hypot(x + 100 * np.cos(yaw) - x1, y + 100 * np.sin(yaw) - y1).mean()  # m, how far off 100 m would end without turning
-        if scans < 100 or s[-1] - s[0] > 0.72 * scans and 0.9 < turn.std() < 1.45 and min(turn.max(), -turn.min()) > 0.5 and astray > 45:
+    rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
+    t = np.arange(scans + 1) * 0.1  # [s]
+    for _ in range(1000):  # draw again until the drive can be measured
+        position, distance, length = _drive(rng, scans, style)
+        s = distance(t)  # (scans + 1,)
+        if scans < 100 or _is_fast_and_winding(position, s):
             break
-    T, length = _ego(rng, at, s_of, scans), min(length, s_of(t[-1]) + 120)
-    prisms = _roadside(rng, at, length, style[3])
-    n, t = 2 + int(length / 45), t[:-1]  # cars: one before us, one behind us, the rest comes towards us
-    looks, left = _looks(rng, n), np.where(np.arange(n) < 2, 0, LANE)
-    s = np.concatenate([[s_of(t + rng.uniform(1.6, 3)), s_of(t - rng.uniform(1.6, 3))],
-                        rng.uniform(60, length + 80, (n - 2, 1)) - rng.uniform(6, 12, (n - 2, 1)) * t])  # (n,scans)
-    here = (s > 0) & (s < length)
+    T = _sensor_poses(rng, position, distance, scans)
+    length = min(length, s[-1] + 120)  # the road farther ahead is not seen
+    prisms = _roadside(rng, position, length, style.odds)
+
+    # Cars on the road: one before us, one behind us, all others come towards us
+    n, t = 2 + int(length / 45), t[:-1]
+    looks = _car_looks(rng, n)  # (3,n)
+    left = np.where(np.arange(n) < 2, 0, LANE)  # (n,)
+    before, behind = distance(t + rng.uniform(1.6, 3)), distance(t - rng.uniform(1.6, 3))
+    start, speed = rng.uniform(60, length + 80, (n - 2, 1)), rng.uniform(6, 12, (n - 2, 1))
+    s = np.concatenate([[before, behind], start - speed * t])  # (n,scans)
+    on_road = (s > 0) & (s < length)
 
     def moving(i):
-        k = here[:, i]
-        return _cars(*at(s[k, i], left[k]), looks[:, k])
-    ground, (hills, T_hills) = _ground(rng, at, length), _hills(rng, T)
-    return T_hills, T, prisms, moving, ground, hills
+        k = on_road[:, i]
+        x, y, yaw = position(s[k, i], left[k])
+        return _cars(x, y, yaw, looks[:, k])
+
+    ground = _ground(rng, position, length)
+    height, T_hills = _hills(rng, T)
+    return _World(T_hills, T, prisms, moving, ground, height)
+
+
+def _is_fast_and_winding(position, s):
+    """Whether a drive has segments of 100 m in which errors of rotation matter.
+
+    s (scans + 1,): distances along the road, 0.1 s apart.
+    """
+    fast = s[-1] - s[0] > 0.72 * (len(s) - 1)
+    turn = np.degrees(np.diff(position(s)[2]))  # yaw of every step
+    turning = 0.9 < turn.std() < 1.45 and min(turn.max(), -turn.min()) > 0.5
+    # How far off a segment of 100 m would end without turning, on average
+    start = s[s <= max(s[-1] - 100, s[0])]
+    x, y, yaw = position(start)
+    x_end, y_end, _ = position(start + 100)
+    astray = np.hypot(x + 100 * np.cos(yaw) - x_end, y + 100 * np.sin(yaw) - y_end).mean()
+    return fast and turning and astray > 45
+
+
+# The sensor
 
 
 class _Rays:
-    """The rays of a scan, numbered by beam, the top one first, and by azimuth *in the world*, so that a column of rays is one line in plan.
+    """The rays of a scan, numbered by beam, from the top, and by column.
 
-    Roll and pitch are exact: they change the elevation, in the world, of the ray that has the beam's elevation in the sensor frame and the
-    column's azimuth in the world's. With n the sensor's up in the world, sin e = n . ray = gain sin(w + tilt)."""
+    All rays of a column have the same azimuth in the world, so in plan (seen from above) they are
+    one line. There are A columns. Roll and pitch are exact: they change a ray's elevation. A beam
+    of elevation e in the sensor's frame has the elevation w in the world, with
+    sin(e) = n . ray = gain * sin(w + tilt), where n is the sensor's up axis in the world.
+    """
 
     def __init__(self, R, azimuth, rng):
-        self.step = 2 * np.pi / azimuth  # rad, from a column to the next
-        self.a0 = np.arctan2(R[1, 0], R[0, 0]) + self.step * rng.random()  # rad, azimuth of the first column
-        a = self.a0 + self.step * np.arange(azimuth)
-        along = R[0, 2] * np.cos(a) + R[1, 2] * np.sin(a)
-        columns = np.cos(a), np.sin(a), np.arctan2(along, R[2, 2]), np.hypot(along, R[2, 2])
-        self.cos_a, self.sin_a, self.tilt, self.gain = (v.astype(np.float32) for v in columns)  # (A,) each
-        w = np.arcsin(np.sin(ELEVATION[::-1]).astype(np.float32)[:, None] / self.gain) - self.tilt  # (64,A) elevation in the world
+        self.step = 2 * np.pi / azimuth  # angle from a column to the next
+        heading = np.arctan2(R[1, 0], R[0, 0])
+        self.a0 = heading + self.step * rng.random()  # azimuth of the first column
+        a = self.a0 + self.step * np.arange(azimuth)  # (A,)
+        along = R[0, 2] * np.cos(a) + R[1, 2] * np.sin(a)  # (A,)
+        self.cos_a = np.cos(a).astype(np.float32)
+        self.sin_a = np.sin(a).astype(np.float32)
+        self.tilt = np.arctan2(along, R[2, 2]).astype(np.float32)
+        self.gain = np.hypot(along, R[2, 2]).astype(np.float32)
+        sin_e = np.sin(ELEVATION[::-1]).astype(np.float32)[:, None]  # (64,1)
+        w = np.arcsin(sin_e / self.gain) - self.tilt  # (64,A)
         self.top = np.tan(w[0])  # (A,) slope of the highest beam
-        self.sin_w, self.cos_w = np.sin(w).ravel(), np.cos(w).ravel()
-        self.slope = self.sin_w / self.cos_w  # (64 A,) as the two before
+        self.sin_w, self.cos_w = np.sin(w).ravel(), np.cos(w).ravel()  # (64 A,)
+        self.slope = self.sin_w / self.cos_w  # (64 A,)
 
 
-def _count_from(first, count):
-    """first[i], first[i] + 1, ..., `count[i]` numbers for each i -> their i and the numbers, (sum of the counts,) each."""
+def _expand_ranges(first, count):
+    """Expand n ranges of integers, each of count[i] numbers from first[i] on.
+
+    first, count (n,) -> two arrays, as long as the sum of the counts: the i of each number, and the
+    numbers.
+    """
     i = np.repeat(np.arange(len(count)), count)
-    return i, np.arange(len(i)) + np.repeat(first - np.cumsum(count) + count, count)
+    end = np.cumsum(count)
+    return i, np.arange(len(i)) + np.repeat(first - end + count, count)
 
 
-def _cut(p, eye, rays):
-    """Every pair (prism, column of rays that may meet it) of p (n,10): prism, column, where the column's line enters and leaves the prism
-    in plan [m], and how squarely, each (P,). A box is two slabs, a cylinder a circle."""
-    dx, dy, c, s = p[:, X] - eye[0], p[:, Y] - eye[1], np.cos(p[:, YAW]), np.sin(p[:, YAW])
-    ox, oy = -(c * dx + s * dy), s * dx - c * dy  # the eye in the prism's frame
-    sx, sy = np.array([[1, 1, -1, -1], [1, -1, 1, -1]])[:, None] * p[:, [HALF_X, HALF_Y]].T[:, :, None]  # (n,4) corners
+def _cross_prisms(p, eye, rays):
+    """Where columns of rays cross prisms (n,10) in plan.
+
+    Returns five arrays (P,), for the P pairs of a prism and a column that may meet: prism, column,
+    distance at which the column's line enters the prism, distance at which it leaves it, and cosine
+    of the angle of incidence. A box is the intersection of two slabs, a cylinder is a circle.
+    """
+    dx, dy = p[:, X] - eye[0], p[:, Y] - eye[1]
+    c, s = np.cos(p[:, YAW]), np.sin(p[:, YAW])
+    eye_x, eye_y = -(c * dx + s * dy), s * dx - c * dy  # the eye in the prism's frame
+
+    # The columns between the leftmost and the rightmost corner; all columns from inside a prism
+    corner_x = np.array([1, 1, -1, -1]) * p[:, HALF_X, None]  # (n,4) in the prism's frame
+    corner_y = np.array([1, -1, 1, -1]) * p[:, HALF_Y, None]  # (n,4)
+    to_x = dx[:, None] + c[:, None] * corner_x - s[:, None] * corner_y  # (n,4) in the world
+    to_y = dy[:, None] + s[:, None] * corner_x + c[:, None] * corner_y  # (n,4)
     centre = np.arctan2(dy, dx)
-    wide = np.arctan2(dy[:, None] + s[:, None] * sx + c[:, None] * sy, dx[:, None] + c[:, None] * sx - s[:, None] * sy) - centre[:, None]
-    wide = (wide + np.pi) % (2 * np.pi) - np.pi  # of a cylinder, these are the corners of the box around it
+    wide = np.arctan2(to_y, to_x) - centre[:, None]  # (n,4) azimuth of the corners
+    wide = (wide + np.pi) % (2 * np.pi) - np.pi  # within -pi to pi
     first = np.ceil((centre + wide.min(axis=1) - rays.a0) / rays.step).astype(int)
     last = np.floor((centre + wide.max(axis=1) - rays.a0) / rays.step).astype(int)
-    inside = (np.abs(ox) < p[:, HALF_X] + 0.3) & (np.abs(oy) < p[:, HALF_Y] + 0.3)
-    k, col = _count_from(first, np.where(inside, 0, last - first + 1))
+    inside = (np.abs(eye_x) < p[:, HALF_X] + 0.3) & (np.abs(eye_y) < p[:, HALF_Y] + 0.3)
+    k, col = _expand_ranges(first, np.where(inside, 0, last - first + 1))  # (P,)
     col %= len(rays.cos_a)
-    of_prism = np.stack([c, s, ox, oy, p[:, HALF_X], p[:, HALF_Y], dx, dy, p[:, ROUND]])
-    c, s, ox, oy, hx, hy, dx, dy, disc = of_prism.astype(np.float32)[:, k]
+
+    # From here on one number for every pair, in float32
+    of_prism = np.stack([c, s, eye_x, eye_y, p[:, HALF_X], p[:, HALF_Y], dx, dy, p[:, ROUND]])
+    c, s, eye_x, eye_y, half_x, half_y, dx, dy, disc = of_prism.astype(np.float32)[:, k]
     ca, sa, disc = rays.cos_a[col], rays.sin_a[col], disc > 0
     with np.errstate(divide="ignore", invalid="ignore"):
-        ux, uy = 1 / (c * ca + s * sa), 1 / (c * sa - s * ca)
-        mx, my, rx, ry = -ox * ux, -oy * uy, hx * np.abs(ux), hy * np.abs(uy)
-        middle, chord = dx * ca + dy * sa, np.sqrt(np.maximum(hx * hx - (dx * sa - dy * ca) ** 2, 0))
-        enter = np.where(disc, middle - chord, np.maximum(mx - rx, my - ry))
-        leave = np.where(disc, middle + chord, np.minimum(mx + rx, my + ry))
-        return k, col, enter, leave, np.where(disc, chord / hx, 1 / np.where(mx - rx > my - ry, np.abs(ux), np.abs(uy)))
+        # Box: distance along the ray for each metre along the prism's axes, and the two slabs
+        per_x, per_y = 1 / (c * ca + s * sa), 1 / (c * sa - s * ca)
+        middle_x, middle_y = -eye_x * per_x, -eye_y * per_y
+        half_slab_x, half_slab_y = half_x * np.abs(per_x), half_y * np.abs(per_y)
+        box_enter = np.maximum(middle_x - half_slab_x, middle_y - half_slab_y)
+        box_leave = np.minimum(middle_x + half_slab_x, middle_y + half_slab_y)
+        through_x = middle_x - half_slab_x > middle_y - half_slab_y
+        box_facing = 1 / np.where(through_x, np.abs(per_x), np.abs(per_y))
+        # Cylinder: the point nearest to its axis, and half of the chord
+        middle = dx * ca + dy * sa
+        half_chord = np.sqrt(np.maximum(half_x * half_x - (dx * sa - dy * ca) ** 2, 0))
+        enter = np.where(disc, middle - half_chord, box_enter)
+        leave = np.where(disc, middle + half_chord, box_leave)
+        facing = np.where(disc, half_chord / half_x, box_facing)
+    return k, col, enter, leave, facing
 
 
-def _meet_prisms(p, eye, rays, rng):
-    """What each ray meets first among the prisms: (4,64 A) distance in plan (inf: nothing), cosine of incidence, albedo, fuzz."""
+def _hit_prisms(p, eye, rays, rng):
+    """The first hit of each ray on prisms (n,10).
+
+    Returns (4,64 A): distance in plan (infinite for no hit), cosine of the angle of incidence,
+    albedo, and the depth to which light can get in.
+    """
     f4, h = np.float32, np.float32(eye[2])
-    p = p[np.hypot(p[:, X] - eye[0], p[:, Y] - eye[1]) - np.hypot(p[:, HALF_X], p[:, HALF_Y]) < CITY_RANGE]
-    k, col, enter, leave, facing = _cut(p, eye, rays)
-    z0, z1, fuzz = np.stack([p[:, Z0] - h, p[:, Z1] - h, p[:, FUZZ]]).astype(f4)[:, k]
+    distance = np.hypot(p[:, X] - eye[0], p[:, Y] - eye[1])
+    p = p[distance - np.hypot(p[:, HALF_X], p[:, HALF_Y]) < CITY_RANGE]
+    k, col, enter, leave, facing = _cross_prisms(p, eye, rays)
+    z0, z1, fuzz = np.stack([p[:, Z0] - h, p[:, Z1] - h, p[:, FUZZ]]).astype(f4)[:, k]  # (P,)
     met = (enter < leave) & (enter > 0.5)
-    # nothing is seen behind a prism that stops every beam of its column
+
+    # Nothing is seen behind a solid prism that stops every beam of its column
     full = met & (z0 <= 0.01 - h) & (z1 > enter * rays.top[col]) & (fuzz == 0)
-    wall = np.full(len(rays.cos_a), CITY_RANGE, f4)
+    wall = np.full(len(rays.cos_a), CITY_RANGE, f4)  # (A,) distance to the nearest such prism
     np.minimum.at(wall, col[full], enter[full])
     seen = met & (enter <= wall[col])
-    k, col, enter, leave, facing, z0, z1, fuzz = (v[seen] for v in (k, col, enter, leave, facing, z0, z1, fuzz))
-    # its candidate beams lie between its lowest and its highest visible edge; seen from above, the highest is the far edge of the roof
-    beam_of = lambda m: np.searchsorted(ELEVATION, np.arcsin(np.clip(rays.gain[col] * np.sin(np.arctan(m) + rays.tilt[col]), -1, 1)))
-    low, high = beam_of(z0 / np.where(z0 > 0, leave, enter)), beam_of(z1 / np.where(z1 > 0, enter, leave))
-    g, beam = _count_from(low, np.maximum(high - low, 0))  # the pair and the beam of every candidate
+    pairs = k, col, enter, leave, facing, z0, z1, fuzz
+    k, col, enter, leave, facing, z0, z1, fuzz = (values[seen] for values in pairs)
+
+    # Candidate beams are those between the lowest and the highest visible edge of a prism. If we
+    # look down on it, the highest is the far edge of its top.
+    def beam_above(slope):
+        sin_e = rays.gain[col] * np.sin(np.arctan(slope) + rays.tilt[col])
+        return np.searchsorted(ELEVATION, np.arcsin(np.clip(sin_e, -1, 1)))
+
+    low = beam_above(z0 / np.where(z0 > 0, leave, enter))
+    high = beam_above(z1 / np.where(z1 > 0, enter, leave))
+    g, beam = _expand_ranges(low, np.maximum(high - low, 0))  # pair and beam of each candidate
     ray = (63 - beam) * len(rays.cos_a) + col[g]
-    stops = (fuzz == 0)[g] | (rng.random(len(g), dtype=f4) > 0.3)  # light passes through foliage here and there
+    stops = (fuzz == 0)[g] | (rng.random(len(g), dtype=f4) > 0.3)  # foliage has holes
     g, ray = g[stops], ray[stops]
-    m = rays.slope[ray]
-    z = m * enter[g]
+
+    # A ray hits the face of the prism or, above or below it, its top or its bottom
+    slope = rays.slope[ray]
+    z = slope * enter[g]
     above, below = z > z1[g] + 1e-3, z < z0[g] - 1e-3
     with np.errstate(divide="ignore", invalid="ignore"):
-        reach = np.where(above | below, np.where(above, z1[g], z0[g]) / m, enter[g])  # its top or its underside, if not its face
-    d, cosine, shade, blur = out = np.zeros((4, len(rays.slope)), f4)
+        level = np.where(above, z1[g], z0[g])
+        reach = np.where(above | below, level / slope, enter[g])
+
+    # Keep the nearest hit of each ray
+    hits = np.zeros((4, len(rays.slope)), f4)
+    d, cosine, albedo, depth = hits  # views of its rows
     d[:] = np.inf
     np.minimum.at(d, ray, reach)
     best = reach <= d[ray]
-    hit, g, flat = ray[best], g[best], (above | below)[best]
-    cosine[hit] = np.where(flat, np.abs(rays.sin_w[hit]), facing[g] * rays.cos_w[hit])
-    shade[hit], blur[hit] = p[k, ALBEDO].astype(f4)[g], np.where(fuzz > 0, fuzz, RELIEF * (z1 - z0 > 3))[g]
-    return out
+    hit, g, level_hit = ray[best], g[best], (above | below)[best]
+    cosine[hit] = np.where(level_hit, np.abs(rays.sin_w[hit]), facing[g] * rays.cos_w[hit])
+    albedo[hit] = p[k, ALBEDO].astype(f4)[g]
+    relief = np.where(z1 - z0 > 3, RELIEF, 0)
+    depth[hit] = np.where(fuzz > 0, fuzz, relief)[g]
+    return hits
 
 
-def _meet_ground(met, ground, eye, rays):
-    """Fills in, where `met` of `_meet_prisms` holds nothing, what the ray meets on the ground, unless our own car is in its way."""
-    d, cosine, shade, _ = met
+def _hit_ground(hits, ground, eye, rays):
+    """Add to the `hits` of `_hit_prisms` the ground, for rays that have hit nothing so far.
+
+    The lowest beams hit our own car instead, its bonnet and its boot, and return nothing.
+    """
+    d, cosine, shade, _ = hits
     height, albedo, corner = ground
     f4, h, azimuth = np.float32, np.float32(eye[2]), len(rays.cos_a)
-    aside = np.abs((rays.step * np.arange(azimuth) + np.pi) % (2 * np.pi) - np.pi)  # the lowest beams meet our own bonnet and boot
-    own_car = np.where(aside < 0.4, 6, np.where(aside > 2.55, 13, 0)) > np.arange(63, -1, -1)[:, None]
-    low = np.flatnonzero((d == np.inf) & (rays.slope < -h / f4(CITY_RANGE)) & ~own_car.ravel())
-    m, col = rays.slope[low], low % azimuth
-    flat = -h / m
-    for _ in range(2):  # where it meets the plane, then where it meets the ground found there
-        cell = tuple(((e + flat * v[col]) / CELL).astype(np.int32) for e, v in zip((eye[:2] - corner).astype(f4), (rays.cos_a, rays.sin_a)))
-        flat = (height[cell] - h) / m
-    d[low], cosine[low], shade[low] = flat, -rays.sin_w[low], albedo[cell]
+    off_axis = np.abs((rays.step * np.arange(azimuth) + np.pi) % (2 * np.pi) - np.pi)
+    blocked = np.where(off_axis < 0.4, 6, np.where(off_axis > 2.55, 13, 0))  # number of beams
+    own_car = blocked > np.arange(63, -1, -1)[:, None]  # (64,A)
+    descending = rays.slope < -h / f4(CITY_RANGE)
+    low = np.flatnonzero((d == np.inf) & descending & ~own_car.ravel())
+
+    # Intersect the ray with the plane z = 0, then twice with the height of the ground found there
+    col, slope = low % azimuth, rays.slope[low]
+    x0, y0 = (eye[:2] - corner).astype(f4)
+    cos_a, sin_a = rays.cos_a[col], rays.sin_a[col]
+    reach = -h / slope
+    for _ in range(2):
+        i = ((x0 + reach * cos_a) / CELL).astype(np.int32)
+        j = ((y0 + reach * sin_a) / CELL).astype(np.int32)
+        reach = (height[i, j] - h) / slope
+    d[low], cosine[low], shade[low] = reach, -rays.sin_w[low], albedo[i, j]
 
 
 def _simulate_scan(name, seed, scans, azimuth, i):
     """Scan i of a sequence -> (N,4) float32, beam by beam from the top.
 
-    What makes it cheap: a column of rays is one line in plan, so a prism is cut once per column, and which beams it stops follows from
-    two heights."""
-    T, flat, prisms, moving, ground, hills = _world(name, seed, scans)
-    rng = np.random.default_rng([seed, zlib.crc32(name.encode()), i])  # of the scan, so that it does not matter who makes it
-    R, eye, f4 = T[i, :3, :3], flat[i, :3, 3], np.float32
-    rays = _Rays(flat[i, :3, :3], azimuth, rng)
-    met = _meet_prisms(np.concatenate([prisms, moving(i)]), eye, rays, rng)
-    _meet_ground(met, ground, eye, rays)
-    # returns: noise, drop-outs, intensity
-    ray = np.flatnonzero(met[0] < CITY_RANGE)
-    d, cosine, shade, blur = met[:, ray]
-    noise = lambda: rng.standard_normal(len(ray), dtype=f4)
+    This is fast because a column of rays is one line in plan: its crossing with a prism is computed
+    once for all beams. The heights of the prism's bottom and top then tell which beams hit it.
+    """
+    world = _world(name, seed, scans)
+    R, eye, f4 = world.T[i, :3, :3], world.T_flat[i, :3, 3], np.float32
+    # The random numbers depend on the scan, so it does not matter which process makes it
+    rng = np.random.default_rng([seed, zlib.crc32(name.encode()), i])
+    rays = _Rays(world.T_flat[i, :3, :3], azimuth, rng)
+    hits = _hit_prisms(np.concatenate([world.prisms, world.moving(i)]), eye, rays, rng)
+    _hit_ground(hits, world.ground, eye, rays)
+
+    ray = np.flatnonzero(hits[0] < CITY_RANGE)  # (M,)
     col = ray % azimuth
-    ways = rays.cos_a[col], rays.sin_a[col], rays.slope[ray]  # for each metre in plan
-    a, b, c = (np.floor((start + d * way) / 0.6).astype(np.int64) for start, way in zip(eye, ways))  # in cells of 0.6 m of the world
-    # how deep light gets there into foliage, or into the windows and doors of a facade: 0 to 1, the same in every scan
-    rough = ((a * 73856093 ^ b * 19349663 ^ c * 83492791) % 1009).astype(f4) / 1009
-    r = d / rays.cos_w[ray] + 0.02 * noise() + blur * (0.8 * rough + 0.2 * rng.random(len(ray), dtype=f4))
-    lost = 0.01 + 0.10 * (r / 40) ** 2 * (0.15 / (0.05 + shade)) + 0.3 * np.exp(-cosine / 0.02) + 0.5 * np.exp(-shade / 0.03)
-    light = shade * (0.65 + 0.4 * np.sqrt(cosine)) + 0.08 * noise() - 0.01 * np.maximum(r - 25, 0)  # from 60 m on KITTI's are mostly 0
-    light *= rng.random(len(ray), dtype=f4) > 0.08
-    back = (rng.random(len(ray), dtype=f4) > lost) & (r < CITY_RANGE) & (r > MIN_RANGE)
-    ray, col, r, light = ray[back], col[back], r[back], light[back]
+    d, cosine, albedo, depth = hits[:, ray]  # (M,) each
+    cos_a, sin_a = rays.cos_a[col], rays.sin_a[col]
+
+    def noise():
+        return rng.standard_normal(len(ray), dtype=f4)
+
+    def uniform():
+        return rng.random(len(ray), dtype=f4)
+
+    # Range. Light gets into foliage, or into the windows and doors of a facade, by a depth that is
+    # random for each cell of 0.6 m but the same in every scan.
+    directions = cos_a, sin_a, rays.slope[ray]  # for each metre in plan
+    a, b, c = (np.floor((start + d * direction) / 0.6).astype(np.int64)  # number of the cell
+               for start, direction in zip(eye, directions))
+    rough = ((a * 73856093 ^ b * 19349663 ^ c * 83492791) % 1009).astype(f4) / 1009  # 0 to 1
+    r = d / rays.cos_w[ray] + 0.02 * noise()
+    r += depth * (0.8 * rough + 0.2 * uniform())
+
+    # Intensity. From 60 m on, KITTI's intensities are mostly 0.
+    light = albedo * (0.65 + 0.4 * np.sqrt(cosine)) + 0.08 * noise() - 0.01 * np.maximum(r - 25, 0)
+    light[uniform() <= 0.08] *= 0  # some are lost; keeps the sign, so that files stay the same
+
+    # Drop-outs: far and dark, grazing, or very dark
+    far = 0.10 * (r / 40) ** 2 * (0.15 / (0.05 + albedo))
+    lost = 0.01 + far + 0.3 * np.exp(-cosine / 0.02) + 0.5 * np.exp(-albedo / 0.03)
+    returned = (uniform() > lost) & (r < CITY_RANGE) & (r > MIN_RANGE)
+    ray, r, light = ray[returned], r[returned], light[returned]
+    cos_a, sin_a = cos_a[returned], sin_a[returned]
+
+    # Points relative to the eye along the axes of the world. The hills lift them: a crest does not
+    # hide anything.
     d = r * rays.cos_w[ray]
-    x, y, z = d * rays.cos_a[col], d * rays.sin_a[col], r * rays.sin_w[ray]  # from the eye, axes of the world
-    z += (hills(x + f4(eye[0]), y + f4(eye[1])) - hills(*eye[:2])).astype(f4)  # what a crest would hide is still seen
-    # R^T turns them into the sensor's; no BLAS, whose sums depend on its threads
-    x, y, z = (x * q[0] + y * q[1] + z * q[2] for q in R.T.astype(f4))
-    return np.stack([x, y, z, np.round(np.clip(light, 0, 0.99), 2)], axis=1)  # (N,4)
+    x, y, z = d * cos_a, d * sin_a, r * rays.sin_w[ray]
+    lift = world.height(x + f4(eye[0]), y + f4(eye[1])) - world.height(*eye[:2])
+    z += lift.astype(f4)
+    # Rotate them by R^T to the sensor's axes; without BLAS, whose sums depend on its threads
+    points = [x * row[0] + y * row[1] + z * row[2] for row in R.T.astype(f4)]
+    intensity = np.round(np.clip(light, 0, 0.99), 2)
+    return np.stack([*points, intensity], axis=1)  # (N,4)
+
+
+# Writing sequences
 
 
 def _save_scan(task):
+    """Simulate a scan and write it; task: path, sequence, settings, number of the scan."""
     path, name, settings, i = task
-    _simulate_scan(name, settings["seed"], settings["scans"], settings["azimuth"], i).tofile(path)
+    scan = _simulate_scan(name, settings["seed"], settings["scans"], settings["azimuth"], i)
+    scan.tofile(path)
 
 
 def _calibration():
-    """Tr (4,4) and the text of calib.txt, of a camera that looks along x as KITTI's does: axes permuted, a fraction of a degree off, 8 cm
-    lower and 27 cm further ahead."""
+    """Tr (4,4), and the text of calib.txt.
+
+    As in KITTI, the camera looks along the Velodyne's x axis. It is turned by a fraction of a
+    degree, 8 cm lower than the Velodyne and 27 cm ahead of it.
+    """
+    axes = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]  # from x forward, y left, z up to the camera's
+    turn = Rotation.from_euler("xyz", [0.4, -0.5, 0.3], degrees=True).as_matrix()
     Tr = np.eye(4)
-    Tr[:3, :3] = Rotation.from_euler("xyz", [0.4, -0.5, 0.3], degrees=True).as_matrix() @ [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+    Tr[:3, :3] = turn @ axes
     Tr[:3, 3] = [-0.012, -0.076, -0.272]
-    P = [np.array([[718.856, 0, 607.193, x], [0, 718.856, 185.216, 0], [0, 0, 1, 0]]) for x in (0, -386.1, 45.4, -337.3)]
-    calib = "".join(f"{k}: {' '.join(f'{x:.12e}' for x in m.ravel())}\n" for k, m in zip(("P0", "P1", "P2", "P3", "Tr"), (*P, Tr[:3])))
-    return Tr, calib
+    rows = {}
+    for name, x in (("P0", 0), ("P1", -386.1), ("P2", 45.4), ("P3", -337.3)):
+        rows[name] = np.array([[718.856, 0, 607.193, x], [0, 718.856, 185.216, 0], [0, 0, 1, 0]])
+    rows["Tr"] = Tr[:3]
+    lines = []
+    for name, matrix in rows.items():
+        numbers = " ".join(f"{x:.12e}" for x in matrix.ravel())
+        lines.append(f"{name}: {numbers}\n")
+    return Tr, "".join(lines)
 
 
-def _missing(root, names, seed, scans, azimuth):
-    """Sequence -> its settings, of those that are not in ROOT yet. ValueError for what is there from elsewhere or with other settings."""
-    jobs = {}
+def _expand_splits(sequences):
+    """Names of sequences and splits -> names of sequences, each once."""
+    names = [sequences] if isinstance(sequences, str) else sequences
+    expanded = {}  # a dict keeps the order
+    for name in names:
+        members = sum(SPLITS.values(), ()) if name == "all" else SPLITS.get(name, (name,))
+        expanded |= dict.fromkeys(members)
+    return list(expanded)
+
+
+def _missing_sequences(root, names, seed, scans, azimuth):
+    """{name: settings} of the sequences that are not in ROOT yet.
+
+    ValueError for a name that cannot be a folder, and for a sequence in ROOT that is not simulated
+    or has other settings.
+    """
+    missing = {}
     for name in names:
         if not isinstance(name, str) or name in ("", ".", "..") or re.search(r"[/\\\0]", name):
-            raise ValueError(f"The sequence name {name!r} is no plain folder name: use one such as '00'.")
-        enough = 170 if name in SPLITS["test"] + SPLITS["validation"] else 320  # for 100 m segments, few enough to make on the spot
-        settings = {"city": CITY, "seed": int(seed), "scans": int(scans or enough), "azimuth": int(azimuth)}
+            raise ValueError(f"The sequence name {name!r} is no plain folder name: use one such "
+                             "as '00'.")
+        # Test and validation: long enough for segments of 100 m, short enough to make on the spot
+        short = name in SPLITS["test"] + SPLITS["validation"]
+        settings = {"city": CITY, "seed": int(seed), "scans": int(scans or (170 if short else 320)),
+                    "azimuth": int(azimuth)}
         folder, truth = root / "sequences" / name, root / "poses" / f"{name}.txt"
-        made = folder / "simulated.json"
-        if folder.exists() or truth.exists():  # another process may make it at any moment, so only now see what it is
+        if folder.exists() or truth.exists():
+            # Another process may be making it, so look at its settings only now
+            made = folder / "simulated.json"
             found = made.read_text() if made.exists() else "not simulated"
             if found != json.dumps(settings):
-                raise ValueError(f"{folder} or {truth} is there already, {found} and not {json.dumps(settings)}: choose another folder.")
+                raise ValueError(f"{folder} or {truth} is there already, {found} and not "
+                                 f"{json.dumps(settings)}: choose another folder.")
         if not (folder.exists() and truth.exists()):
-            jobs[name] = settings
-    return jobs
+            missing[name] = settings
+    return missing
 
 
-def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range(11)), scans=None, azimuth=1800, workers=None) -> Path:
-    """Drives an HDL-64E through one simulated city per sequence and writes ROOT in KITTI's odometry layout with exact ground truth -> ROOT.
+def _finish_sequence(temporary, folder, settings, calib):
+    """Add the small files of a sequence to its temporary folder, and move it to its place."""
+    seconds = [0.1 * i for i in range(settings["scans"])]
+    (temporary / "calib.txt").write_text(calib)
+    (temporary / "times.txt").write_text("".join(f"{t:.6e}\n" for t in seconds))
+    (temporary / "simulated.json").write_text(json.dumps(settings))
+    try:
+        temporary.rename(folder)
+    except OSError:  # another process was faster, or it cannot be renamed
+        if not (folder / "simulated.json").exists():
+            raise
 
-    sequences: names, splits or 'all'; scans: number per sequence (None: 170 for test and validation, which drive more than 115 m, else 320);
-    azimuth: rays per beam and turn; workers: processes (None: one per core). The same arguments give the same bytes, whatever else is made
-    along. A sequence appears when it is complete; one that is there already, made with the same settings, is left as it is.
-    Raises ValueError for arguments out of range, or when ROOT holds such a sequence from elsewhere or of other settings."""
+
+def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range(11)), scans=None,
+             azimuth=1800, workers=None) -> Path:
+    """Simulate an HDL-64E that drives through a city for each sequence, with exact ground truth.
+
+    Writes ROOT in KITTI's odometry layout and returns it. seed: another one gives other cities;
+    sequences: names, splits or "all"; scans: number per sequence (None: 170 for test and
+    validation, which drive more than 115 m, and 320 for all others); azimuth: rays per beam and
+    turn; workers: processes (None: one per core).
+
+    The same arguments give the same bytes, no matter which other sequences are made. A sequence
+    appears when it is complete. One that is there already, made with the same settings, is left as
+    it is. Raises ValueError for arguments out of range, or when ROOT holds such a sequence from
+    elsewhere or with other settings, and OSError.
+    """
     root = Path(root)
-    for what, value, least in (("seed", seed, 0), ("scans", scans, 1), ("azimuth", azimuth, 16), ("workers", workers, 1)):
+    for name, value, least in (("seed", seed, 0), ("scans", scans, 1), ("azimuth", azimuth, 16),
+                               ("workers", workers, 1)):
         if value is not None and (value != int(value) or value < least):
-            raise ValueError(f"{what} is {value} but must be a whole number, {least} or more.")
-    names = [sequences] if isinstance(sequences, str) else sequences
-    names = dict.fromkeys(m for n in names for m in (sum(SPLITS.values(), ()) if n == "all" else SPLITS.get(n, (n,))))
-    jobs = _missing(root, names, seed, scans, azimuth)
+            raise ValueError(f"{name} is {value} but must be a whole number, {least} or more.")
+    missing = _missing_sequences(root, _expand_splits(sequences), seed, scans, azimuth)
+    folders = {name: root / "sequences" / name for name in missing}
     Tr, calib = _calibration()
-    # one name per process: two of them may fill the same ROOT, and whoever finishes a sequence first has made it
-    temporary = {n: temporary_beside(root / "sequences" / n) for n in jobs if not (root / "sequences" / n).exists()}
-    tasks = [(folder / "velodyne" / f"{i:06d}.bin", n, jobs[n], i) for n, folder in temporary.items() for i in range(jobs[n]["scans"])]
+
+    # Each process has temporary folders of its own, so several may fill the same ROOT. The first to
+    # finish a sequence has made it.
+    temporary = {name: temporary_beside(folder) for name, folder in folders.items()
+                 if not folder.exists()}
+    tasks = []
+    for name, folder in temporary.items():
+        for i in range(missing[name]["scans"]):
+            tasks.append((folder / "velodyne" / f"{i:06d}.bin", name, missing[name], i))
     in_pool = (workers or cores()) > 1 and len(tasks) > 8
-    saved = in_processes(_save_scan, tasks, workers, chunksize=8) if in_pool else map(_save_scan, tasks)
+    if in_pool:
+        saved = in_processes(_save_scan, tasks, workers, chunksize=8)
+    else:
+        saved = map(_save_scan, tasks)
     try:
         for folder in temporary.values():
-            shutil.rmtree(folder, ignore_errors=True)  # of an earlier process of the same number
+            shutil.rmtree(folder, ignore_errors=True)  # left by an earlier process with the same id
             (folder / "velodyne").mkdir(parents=True)
         made = progress(saved, len(tasks), "simulating")
-        for name, settings in jobs.items():
-            T, folder = _world(name, settings["seed"], settings["scans"])[0], root / "sequences" / name
+        for name, settings in missing.items():
+            T = _world(name, settings["seed"], settings["scans"]).T
             if name in temporary:
                 for _ in range(len(T)):
                     next(made)
-                (temporary[name] / "calib.txt").write_text(calib)
-                (temporary[name] / "times.txt").write_text("".join(f"{0.1 * i:.6e}\n" for i in range(len(T))))
-                (temporary[name] / "simulated.json").write_text(json.dumps(settings))
-                try:
-                    temporary[name].rename(folder)
-                except OSError:  # another process was faster, or it cannot be
-                    if not (folder / "simulated.json").exists():
-                        raise
-            if (folder / "simulated.json").read_text() != json.dumps(settings):
-                raise ValueError(f"{folder} was made meanwhile, with other settings: choose another folder.")
-            write_poses(root / "poses" / f"{name}.txt", velo_to_camera(invert(T[0]) @ T, Tr))  # last: without it a sequence is not complete
+                _finish_sequence(temporary[name], folders[name], settings, calib)
+            if (folders[name] / "simulated.json").read_text() != json.dumps(settings):
+                raise ValueError(f"{folders[name]} was made meanwhile, with other settings: choose "
+                                 "another folder.")
+            # The poses come last: without them a sequence is not complete
+            T_cam = velo_to_camera(invert(T[0]) @ T, Tr)
+            write_poses(root / "poses" / f"{name}.txt", T_cam)
         next(made, None)  # lets the progress line end
     finally:
         if in_pool:
@@ -1222,21 +1812,39 @@ def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range
     return root
 
 
-def main(argv=None):
-    """The command line -> exit code."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+# ------------------------------------------------------------------------------------------------
+# The command line
+
+
+def _command_line(argv):
+    """Arguments of `simulate` and `raw`."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True, metavar="simulate | raw")
-    s = commands.add_parser("simulate", help="make simulated drives, with ground truth")
-    s.add_argument("dir", metavar="DIR", help="where to")
-    s.add_argument("--seed", type=int, metavar="N", default=0, help="another seed, other cities (default: 0)")
-    s.add_argument("--sequences", nargs="+", metavar="NN", default=["all"], help="names, or train, test, validation, all (default)")
-    s.add_argument("--scans", type=int, metavar="N", help="scans per sequence (default: 170 for test and validation, else 320)")
-    s.add_argument("--azimuth", type=int, metavar="N", default=1800, help="rays per beam and turn (default: 1800)")
-    r = commands.add_parser("raw", help="convert a drive of KITTI's raw data, with ground truth")
-    r.add_argument("drive", metavar="DRIVE",
-                   help="unpacked folder such as 2011_09_26/2011_09_26_drive_0013_sync")
-    r.add_argument("dir", metavar="ROOT", help="where to, in KITTI's odometry layout")
-    args = parser.parse_args(argv)
+
+    add = commands.add_parser("simulate", help=(
+        "make simulated drives, with ground truth")).add_argument
+    add("dir", metavar="DIR", help="folder to write, in KITTI's odometry layout")
+    add("--seed", type=int, metavar="N", default=0, help=(
+        "random seed; another seed gives other cities (default: 0)"))
+    add("--sequences", nargs="+", metavar="NN", default=["all"], help=(
+        "names, or splits: train, test, validation, all (default: all)"))
+    add("--scans", type=int, metavar="N", help=(
+        "scans per sequence (default: 170 for test and validation, 320 for all others)"))
+    add("--azimuth", type=int, metavar="N", default=1800, help=(
+        "rays per beam and turn (default: 1800)"))
+
+    add = commands.add_parser("raw", help=(
+        "convert a drive of KITTI's raw data, with ground truth")).add_argument
+    add("drive", metavar="DRIVE", help=(
+        "unpacked folder such as 2011_09_26/2011_09_26_drive_0013_sync"))
+    add("dir", metavar="ROOT", help="folder to write, in KITTI's odometry layout")
+    return parser.parse_args(argv)
+
+
+def main(argv=None):
+    """The command line -> exit code: 0, 2 for bad input, 130 when interrupted."""
+    args = _command_line(argv)
     terminate_as_interrupted()
     try:
         if args.command == "raw":
@@ -1246,10 +1854,12 @@ def main(argv=None):
             simulate(args.dir, args.seed, args.sequences, args.scans, args.azimuth)
             made = open_sequences(args.dir, args.sequences)
     except (ValueError, OSError) as error:
-        print(f"kitti.py: {' '.join(str(error).split())}", file=sys.stderr)
+        message = " ".join(str(error).split())  # in one line
+        print(f"kitti.py: {message}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("kitti.py: interrupted; sequences that are complete stay, run the same command again for the rest.", file=sys.stderr)
+        print("kitti.py: interrupted; complete sequences are kept, run the same command again for "
+              "the rest", file=sys.stderr)
         return 130
     print(f"{args.dir}: {len(made)} sequences, {sum(map(len, made)):,} scans")
     if args.command == "raw":
