@@ -1361,7 +1361,7 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
 
 def print_and_log(log, line):
     """Print a line and append it to a log file."""
-    with open(log, "a", encoding="utf-8") as file:
+    with metrics.naming(log), open(log, "a", encoding="utf-8") as file:
         file.write(line + "\n")
     print(line, flush=True)
 

@@ -80,7 +80,8 @@ def read_scan(path: str | Path, intensity_max: float = 1) -> np.ndarray:
     """
     path = Path(path)
     scan = _read_npy(path) if path.suffix == ".npy" else _read_bin(path)
-    scan[:, 3] /= intensity_max
+    if intensity_max != 1:
+        scan[:, 3] /= intensity_max
     return scan
 
 

@@ -70,6 +70,17 @@ def _is_dead(process):
 
 
 @contextmanager
+def naming(path):
+    """Name the file in an OSError of the block that does not, for example when the disk is full."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None and error.strerror:
+            raise OSError(error.errno, error.strerror, str(path)) from None
+        raise
+
+
+@contextmanager
 def replacing(path):
     """Yield a temporary path beside `path`, and move it to `path` if the block succeeds.
 
@@ -82,12 +93,9 @@ def replacing(path):
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = temporary_beside(path)
     try:
-        yield temporary
-        os.replace(temporary, path)
-    except OSError as error:
-        if error.filename is None and error.strerror:  # for example when the disk is full
-            raise OSError(error.errno, error.strerror, str(path)) from None
-        raise
+        with naming(path):
+            yield temporary
+            os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 
