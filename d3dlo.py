@@ -696,6 +696,10 @@ def predict_motions(net, records, device="cpu", batch=16, refine=0):
     return np.concatenate(motions)
 
 
+BROKEN = "broken points (not finite, or of a range or intensity no LiDAR returns)"
+UNLIKE = "scans unlike those the weights were trained on, the poses may be wrong"
+
+
 class Odometry:
     """Poses from a stream of scans: `Odometry().register(scan)`.
 
@@ -730,10 +734,6 @@ class Odometry:
             self.pose = self.pose @ motion
         self.last = record
         return self.pose.copy()
-
-
-BROKEN = "broken points (not finite, or of a range or intensity no LiDAR returns)"
-UNLIKE = "a scan unlike those the weights were trained on, the poses may be wrong"
 
 
 def relative_pose(scan_p: np.ndarray, scan_q: np.ndarray, weights: str | Path | None = None,
@@ -834,9 +834,9 @@ GEOMETRY = 4  # increase it when `scan_geometry` changes, so that old caches are
 def warn_about_shift(s, records, seen):
     """Say on stderr how many scans of a sequence are unlike those of the training."""
     shifts = [kitti.domain_shift(stats, seen) for stats in records["stats"]]
-    if any(shifts):
-        print(f"sequence {s.name}: {sum(map(bool, shifts))} of {len(s)} scans are unlike those the "
-              f"weights were trained on, the poses may be wrong: {next(filter(None, shifts))}",
+    shifts = [shift for shift in shifts if shift]
+    if shifts:
+        print(f"sequence {s.name}: {UNLIKE}, {len(shifts)} of {len(s)}: {shifts[0]}",
               file=sys.stderr)
 
 
@@ -871,18 +871,18 @@ def evaluate_folder(net, state, s, out, device="cpu", refine=0, plot=False, say=
     metrics.write_poses(out / "poses.txt", poses)
     kitti.write_tum(out / "poses.tum", poses, s.times)
     files, length = ["poses.txt", "poses.tum"], metrics.path_lengths(poses)[-1]
-    say(f"{s.folder}: {len(s)} scans, path of {length:.1f} m, {rate:.1f} scans a second")
-    for note in s.notes:
-        say(f"note          {note}")
-    say("frame         of the LiDAR in the first scan: x forward, y left, z up, metres\n"
-        f"trajectory    {out}/poses.txt (KITTI pose file)\n"
-        f"              {out}/poses.tum (t x y z qx qy qz qw, t in seconds)")
+    lines = [f"{s.folder}: {len(s)} scans, path of {length:.1f} m, {rate:.1f} scans a second",
+             *(f"note          {note}" for note in s.notes),
+             "frame         of the LiDAR in the first scan: x forward, y left, z up, metres",
+             f"trajectory    {out}/poses.txt (KITTI pose file)",
+             f"              {out}/poses.tum (t x y z qx qy qz qw, t in seconds)"]
     if plot:
         metrics.draw(out / "plot.png", {s.name: (None, poses)})
         files.append("plot.png")
-        say(f"picture       {out}/plot.png (from above)")
+        lines.append(f"picture       {out}/plot.png (from above)")
     source = {"data": str(s.folder), "refine": refine, "files": files}
     metrics.write_json(out / "results.json", source | {"path_m": length, "scans": len(s)})
+    say("\n".join(lines))
     return out
 
 
@@ -946,20 +946,20 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
               for s, records in work}
     seen = {*state["train"].values(), *state["before"]}  # by content: names may repeat
     results = summarize(errors, {s.name: f in seen for s, f in zip(chosen, fingerprints)})
-    say(results_table(results))
-    say(f"trajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)\n"
-        f"figures       {out}/results.json")
     files = [f"{s.name}.txt" for s in chosen]
+    lines = [f"trajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)",
+             f"figures       {out}/results.json"]
     if {f"{i}" for i in range(11, 22)} <= set(errors):  # KITTI's sequences without ground truth
-        say(f"to submit     {zip_for_server(out)}")
+        lines.append(f"to submit     {zip_for_server(out)}")
         files.append("kitti-server.zip")
     if plot:
         T = {s.name: (s.poses_cam, metrics.read_poses(out / f"{s.name}.txt")) for s in chosen}
         metrics.draw(out / "plot.png", T)
-        say(f"picture       {out}/plot.png (from above, errors by length)")
+        lines.append(f"picture       {out}/plot.png (from above, errors by length)")
         files.append("plot.png")
     source = {"weights": str(weights or WEIGHTS), "data": str(root), "refine": refine}
     metrics.write_json(out / "results.json", source | results | {"files": files})
+    say("\n".join([results_table(results), *lines]))
     return out
 
 
