@@ -986,10 +986,10 @@ def zip_for_server(out):
 
 
 # ------------------------------------------------------------------------------------------------
-# 7  The same functions, faster on a CPU
+# 7  Faster versions of functions of parts 2 and 3
 #
-# Nothing here changes a result: the tests prove every function equal to its plain form in parts 2
-# and 3. Memory traffic is what a CPU waits for, so all of it avoids large arrays.
+# Nothing here changes a result: tests prove every function equal to its plain form. A CPU spends
+# most of its time on memory traffic, so the functions for it avoid large arrays.
 
 CHUNK = 192  # points in a chunk; 128 to 256 are about as fast
 # The bits of a byte spread out to every second place, for `morton_order`.
