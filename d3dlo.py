@@ -21,7 +21,7 @@ Frame: Velodyne, x forward, y left, z up, in metres. T_ab maps points from frame
 T_pq is the paper's T_{t,t+1}. Shapes: N points of a scan, S centroids, k neighbours, c features,
 C scans in a batch, B pairs of them; n1, n2, n3 are n_fps of SA1, SA2, SA3.
 
-    python d3dlo.py train                       # simulated city, 10 minutes on two CPU cores
+    python d3dlo.py train                       # simulated city, a quarter of an hour on a CPU
     python d3dlo.py train --data ROOT           # KITTI odometry, the paper's schedule
     python d3dlo.py eval --data ROOT            # with the weights beside this file
 """
@@ -140,7 +140,7 @@ def check_config(config):
 
 # The settings of training, as opposed to those of the network and its input
 TRAINING = "epochs", "batch", "optimizer", "lr", "schedule", "swap", "augment", "frozen"
-# Our short recipe: 10 minutes on the simulated city
+# Our short recipe: a quarter of an hour on the simulated city
 SHORT = dict(max_range=50.0, epochs=9, batch=8, optimizer="muon", lr=1e-2, schedule="one-cycle",
              swap="both", augment=True, frozen=0.25)
 

@@ -184,7 +184,7 @@ def metric(s, form):
         drives.append([d3dlo.accumulate(kitti.from_vector(u)) for u in (v, v + noise)])
     segment_errors = metrics.segment_errors
     if form == "devkit's loops":
-        from test_d3dlo import devkit as segment_errors
+        from test_d3dlo import devkit_errors as segment_errors
     return seconds(lambda: [segment_errors(*pair) for pair in drives], 1)
 
 
