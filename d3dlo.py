@@ -1420,7 +1420,9 @@ def read_run(run):
         data, sequences, seed, weights = (arguments[name] for name in
                                           ("data", "sequences", "seed", "weights"))
         check_number("seed", seed)
-        if not all(isinstance(text, str) for text in (data or "", weights or "", *sequences)):
+        paths_are_sound = all(path is None or isinstance(path, str) for path in (data, weights))
+        names_are_sound = type(sequences) is list and all(isinstance(n, str) for n in sequences)
+        if not (paths_are_sound and names_are_sound):
             raise ValueError("damaged")
     except (ValueError, KeyError, TypeError, AttributeError, OSError):
         raise ValueError(f"{run}/config.json: missing or damaged, so there is no training run to "
