@@ -583,7 +583,7 @@ def require_finite(number):
 
 @torch.inference_mode()
 def mean_loss(net, objective, examples):
-    """The mean loss over `examples`, an iterable of (Batch, T)."""
+    """The mean loss over `examples`, an iterable of (Batch, T). FloatingPointError as above."""
     losses = [objective(net(batch), targets(net, batch, T)).item() for batch, T in examples]
     require_finite(sum(losses))
     return np.mean(losses)
@@ -705,7 +705,7 @@ class Odometry:
 
     weights: a weights file or the folder of a training run, None for the weights beside this file;
     refine: 0 for the paper's plain prediction, otherwise see `predict_refined`. ValueError for an
-    argument that makes no sense, ValueError or FileNotFoundError for weights that cannot be read.
+    invalid argument, ValueError or FileNotFoundError for weights that cannot be read.
     """
 
     def __init__(self, weights: str | Path | None = None, device: str = "cpu", refine: int = 0):
@@ -719,8 +719,8 @@ class Odometry:
     def register(self, scan: np.ndarray) -> np.ndarray:
         """Scan (N,4): x, y, z [m], intensity 0 to 1 -> its pose T_0t (4,4), Velodyne frame.
 
-        The first pose is the identity. Broken points and scans unlike those of the training are
-        warned about. ValueError for a scan that cannot be used; the state is then unchanged.
+        The first pose is the identity. Warns about broken points, and about scans unlike those in
+        training. ValueError for a scan that cannot be used; the state is then unchanged.
         """
         record = scan_geometry(scan, self.net.config)
         if record["broken"]:
@@ -740,7 +740,7 @@ def relative_pose(scan_p: np.ndarray, scan_q: np.ndarray, weights: str | Path | 
                   refine: int = 0) -> np.ndarray:
     """Scans P and Q, (N,4) each -> T_pq (4,4), which maps points of Q into P's Velodyne frame.
 
-    Loads the weights at every call; for many scans use `Odometry`, which takes the same arguments.
+    Loads the weights at every call, so `Odometry` is faster for many scans. Errors as there.
     """
     odometry = Odometry(weights, refine=refine)
     odometry.register(scan_p)
@@ -832,7 +832,7 @@ GEOMETRY = 4  # increase it when `scan_geometry` changes, so that old caches are
 
 
 def warn_about_shift(s, records, seen):
-    """Say on stderr how many scans of a sequence are unlike those of the training."""
+    """Warn on stderr that scans of a sequence are unlike those in training."""
     shifts = [kitti.domain_shift(stats, seen) for stats in records["stats"]]
     shifts = [shift for shift in shifts if shift]
     if shifts:
@@ -1049,7 +1049,7 @@ def farthest_point_sampling(xyz: np.ndarray, n: int, start: int = 0) -> np.ndarr
 
 
 def sample_and_index(xyz, n):
-    """`farthest_point_sampling` and a cKDTree of the points, built meanwhile in a second thread."""
+    """`farthest_point_sampling`, and a cKDTree built at the same time in a second thread."""
     with ThreadPoolExecutor(1) as thread:
         # These options make the tree faster to build and do not slow its queries down.
         tree = thread.submit(cKDTree, xyz, leafsize=48, balanced_tree=False, compact_nodes=False)
@@ -1087,7 +1087,7 @@ def to_device(array, device):
 def neighbours_in_q(xyz, p, q, k):
     """Centroids xyz (C,n,3), index arrays p, q (B,) -> (B,n,k) neighbours in Q of those of P.
 
-    `group_knn` on a CPU. On another device they are found there, so that it need not wait.
+    `group_knn` on a CPU. On other devices the search runs there, to avoid waiting for the CPU.
     """
     if xyz.device.type == "cpu":
         xyz = xyz.numpy()
@@ -1258,7 +1258,7 @@ def check_device(device):
 
 
 def check_number(name, value):
-    """ValueError unless a value is a whole number that fits, 0 or more."""
+    """ValueError unless a value is a whole number, 0 or more, that fits in 64 bits."""
     if not isinstance(value, int) or not 0 <= value < 2**63:
         raise ValueError(f"{name} is {value!r}, but must be a whole number, 0 or more")
 
