@@ -9,7 +9,8 @@ Read this file beside the paper, from top to bottom:
     4  Training                 eq. 2 and section 4
     5  Odometry                 eq. 1
     6  Evaluation               section 5
-    7  Faster versions of functions of parts 2 and 3, with the same results; can be skipped
+    7  Faster versions of functions of parts 2 and 3, with the same results. The code calls these;
+       to understand the method, read parts 2 and 3.
     8  The command line
 
 kitti.py converts motions to the vectors of section 3.2 (`to_vector`), finds the ground plane of
@@ -65,13 +66,13 @@ class Layer(NamedTuple):
 
     r: float | None  # radius of the ball [m]
     n_fps: int | None  # number of centroids kept by farthest point sampling
-    n_n: int | None  # number of neighbours of a point, in a ball at most
+    n_n: int | None  # number of neighbours (the maximum, for a ball)
     mlp: tuple  # output width of every linear layer
 
 
 @dataclass(frozen=True)
 class Config:
-    """Network, input and training. The defaults are the paper's where it says something."""
+    """Network, input and training. The defaults are the paper's wherever it gives a value."""
 
     # Table 1         r    n_fps  n_n   MLP
     sa1: Layer = Layer(1.0, 1024, 8, (4, 8, 16, 32))
@@ -82,21 +83,21 @@ class Config:
     mlp: Layer = Layer(None, None, None, (64, 6))
 
     # Input
-    max_range: float | None = None  # drop points farther away [m]; None keeps whole scans
+    max_range: float | None = None  # drop points farther away [m]; None keeps all valid points
     plane: bool = True  # keep the points of the ground plane, "pp" in Table 2
 
     # Training, section 4
     epochs: int = 500
     batch: int = 16  # pairs of scans in a batch; the paper does not say
-    optimizer: str = "adam"  # ours: "muon", torch.optim.Muon for the matrices of hidden layers
-    lr: float = 1e-3  # learning rate: Adam's default; the highest of the "one-cycle" schedule
-    schedule: str = "steps"  # lr drops at epochs 300 and 400 of 500, to a tenth; ours: "one-cycle"
-    swap: str = "random"  # each pair in a random direction; ours: "both" directions
-    augment: bool = False  # ours: mirror pairs and move Q by small random motions
-    frozen: float = 0.0  # ours: last fraction of the steps, with BatchNorm statistics fixed
+    optimizer: str = "adam"  # the paper's; or ours, "muon": Muon for the hidden matrices
+    lr: float = 1e-3  # learning rate: Adam's default; with "one-cycle" the peak
+    schedule: str = "steps"  # lr drops at epochs 300 and 400 (by 10, ours); or "one-cycle"
+    swap: str = "random"  # the paper's: one direction of each pair; or ours, "both"
+    augment: bool = False  # ours: also mirror pairs and move Q by small random motions
+    frozen: float = 0.0  # ours: final fraction of steps, with fixed BatchNorm statistics
 
     def __post_init__(self):
-        for name in ("sa1", "fe", "sa2", "sa3", "mpn", "mlp"):  # JSON turned tuples into lists
+        for name in ("sa1", "fe", "sa2", "sa3", "mpn", "mlp"):  # from JSON, tuples are lists
             *numbers, mlp = getattr(self, name)
             object.__setattr__(self, name, Layer(*numbers, tuple(mlp)))
         check_config(self)
@@ -124,7 +125,7 @@ def check_config(config):
     require(all(whole(sa.n_fps, 65535) for sa in (sa1, sa2, sa3)), "n_fps must be 1 to 65,535")
     require(sa1.n_fps >= sa2.n_fps >= sa3.n_fps, "n_fps must not grow from layer to layer")
     require(all(whole(x.n_n, 1024) for x in (sa1, fe, sa2, sa3)), "n_n must be 1 to 1,024")
-    require(all(len(w) > 1 and all(map(whole, w)) for w in widths), "an MLP has 2 layers at least")
+    require(all(len(w) > 1 and all(map(whole, w)) for w in widths), "an MLP needs 2 layers or more")
     require(mlp[-1] == 6, "the last width of mlp must be 6: translation and angles")
     require(config.max_range is None or positive(config.max_range), "max_range must be positive")
     require(whole(config.epochs) and whole(config.batch), "epochs and batch must be whole numbers")
@@ -152,7 +153,7 @@ def fps_textbook(xyz, n, start=0):
     """Farthest point sampling: each new centroid is the point farthest from all centroids so far.
 
     xyz (N,3), index of the first centroid -> indices (n,) of the centroids. Ties go to the lowest
-    index. `farthest_point_sampling` in part 7 returns the same indices faster, so it is used.
+    index. The code uses `farthest_point_sampling`, which returns the same indices faster.
     """
     x, y, z = np.ascontiguousarray(xyz.T)
     min_dist = np.full(len(xyz), np.inf, xyz.dtype)  # squared distance to the nearest centroid
@@ -176,7 +177,7 @@ def group_ball(xyz: np.ndarray, centroids: np.ndarray, r: float, n_n: int, tree=
     ranks = [*range(1, n_n + 1)]  # a list keeps the result two-dimensional for n_n = 1
     inclusive = np.nextafter(r, np.inf)  # scipy's bound is exclusive
     _, idx = (tree or cKDTree(xyz)).query(xyz[centroids], ranks, distance_upper_bound=inclusive)
-    return np.where(idx < len(xyz), idx, centroids[:, None])  # scipy's index of no neighbour is N
+    return np.where(idx < len(xyz), idx, centroids[:, None])  # scipy marks a missing one by N
 
 
 def group_knn(xyz: np.ndarray, query: np.ndarray, k: int) -> np.ndarray:
@@ -197,7 +198,7 @@ def geometry_dtype(config):
         ("group_sa1", "f4", (n1, config.sa1.n_n, 4)),  # SA1's neighbours: f_i, x_i - x'_j [m]
         ("idx_sa2", "u2", (n2, config.sa2.n_n)),  # SA2's neighbours, indices into SA1's centroids
         ("idx_sa3", "u2", (n3, config.sa3.n_n)),  # SA3's neighbours, indices into SA2's centroids
-        ("broken", "i4"),  # number of points dropped that cannot be measurements
+        ("broken", "i4"),  # number of invalid points that were dropped
         ("stats", "f4", len(kitti.STATS)),  # scan statistics, to warn about domain shift
     ])
 
@@ -234,7 +235,7 @@ def scan_geometry(scan: np.ndarray, config: Config = Config()) -> np.ndarray:
 class Batch(NamedTuple):
     """The network's input as tensors: C scans and B pairs (P, Q) of them.
 
-    Every scan can be P or Q of a pair, in either direction.
+    A scan may serve as P in one pair and as Q in another.
     """
 
     xyz: torch.Tensor  # (C,n1,3) centroids
@@ -337,9 +338,9 @@ class D3DLO(nn.Module):
     def forward(self, batch: Batch) -> torch.Tensor:
         """Batch -> y_hat (B,6): [tx, ty, tz] in metres, [roll, pitch, yaw] in degrees, of T_pq."""
         p, q = batch.p, batch.q
-        # SA1 for every scan, eq. 3; scan_geometry has gathered its neighbours.
+        # SA1 for every scan, eq. 3. Its inputs [f_i, x_i - x'_j] come gathered: scan_geometry.
         features = self.sa1.mpn(batch.group_sa1)  # (C,1024,32)
-        # FE for every pair, eq. 4. (The backward pass of index_select is faster than of [p].)
+        # FE for every pair, eq. 4. (index_select has a faster backward pass than [p].)
         x, f = batch.xyz[p], features.index_select(0, p)  # (B,1024,3), (B,1024,32) of P
         y, g = batch.xyz[q], features.index_select(0, q)  # (B,1024,3), (B,1024,32) of Q
         e = self.fe(x, f, y, g, batch.idx_fe)  # (B,1024,64)
@@ -370,26 +371,27 @@ def move_scans(scans, T):
     Distances do not change, so sampling and grouping stay valid.
     """
     moved, T = scans.copy(), T.astype(np.float32)
-    R, t = T[:, :3, :3].transpose(0, 2, 1), T[:, None, :3, 3]  # points are rows: x R^T + t
-    moved["xyz"] = scans["xyz"] @ R + t
+    R_T, t = T[:, :3, :3].transpose(0, 2, 1), T[:, None, :3, 3]
+    moved["xyz"] = scans["xyz"] @ R_T + t  # R x + t for points that are rows
     offsets = scans["group_sa1"][..., 1:]  # (C,n1,k1,3)
-    moved["group_sa1"][..., 1:] = (offsets.reshape(len(T), -1, 3) @ R).reshape(offsets.shape)
+    moved["group_sa1"][..., 1:] = (offsets.reshape(len(T), -1, 3) @ R_T).reshape(offsets.shape)
     return moved
 
 
 def augment(scans, T_pq, rng):
-    """Mirror half of the pairs left to right and move every Q by a small random motion A.
+    """Mirror half of the pairs left to right, then move every Q by a small random motion.
 
-    Records of scans (2n,), all P and then all Q, and poses (n,4,4) -> the same, changed: a point q
-    becomes A q, and T_pq becomes T_pq A^-1. A quarter of the pairs is aligned first, so that
-    little motion is left, as in refinement. Not in the paper.
+    Records of scans (2n,), all P and then all Q, and poses (n,4,4) -> the same, changed. For a
+    quarter of the pairs, Q is aligned with P first, so that little motion is left. After mirroring,
+    a point q becomes A q and T_pq becomes T_pq A^-1. Not in the paper.
     """
     n = len(T_pq)
     mirror = np.where(rng.random((n, 1, 1)) < 0.5, np.diag([1.0, -1, 1, 1]), np.eye(4))
     T_pq = mirror @ T_pq @ mirror
     scale = [0.25, 0.1, 0.03, 0.1, 0.1, 1.0]  # m, degrees; most in yaw: turns are rare
-    A = from_vector(rng.normal(size=(n, 6)) * scale)
-    A = A @ np.where(rng.random((n, 1, 1)) < 0.25, T_pq, np.eye(4))
+    small = from_vector(rng.normal(size=(n, 6)) * scale)
+    align = np.where(rng.random((n, 1, 1)) < 0.25, T_pq, np.eye(4))
+    A = small @ align
     return move_scans(scans, np.concatenate([mirror, A @ mirror])), T_pq @ invert(A)
 
 
@@ -410,9 +412,10 @@ def training_batch(geometry, motions, pairs, config, rng, device="cpu"):
 
 
 def steps_per_epoch(motions, config):
-    """Number of batches in an epoch: every pair once, `config.batch` pairs or a few more in each.
+    """Number of batches in an epoch, in which every pair occurs once.
 
-    ValueError when a batch would hold one direction of one pair, which has no batch statistics.
+    A batch has `config.batch` pairs or more, but fewer than twice as many. ValueError when it would
+    hold one direction of one pair, which has no batch statistics.
     """
     pairs = sum(map(len, motions))
     if config.swap == "random" and min(pairs, config.batch) < 2:
@@ -422,9 +425,9 @@ def steps_per_epoch(motions, config):
 
 
 def batches(geometry, motions, config, seed, start, stop, device="cpu"):
-    """Yield the training batches number `start` to `stop` - 1, each prepared during the one before.
+    """Yield training batches `start` to `stop` - 1, preparing each while the last one is in use.
 
-    A batch depends on `seed` (a tuple) and its number alone, so an interrupted training run
+    A batch depends only on `seed` (a tuple) and its number, so an interrupted training run
     continues with the batches it would have seen.
     """
     pairs = np.array([(s, i) for s, T in enumerate(motions) for i in range(len(T))])
@@ -434,7 +437,7 @@ def batches(geometry, motions, config, seed, start, stop, device="cpu"):
         epoch, part = divmod(step, per_epoch)
         order = np.random.default_rng([*seed, epoch]).permutation(len(pairs))
         chosen = np.array_split(order, per_epoch)[part]  # parts of nearly equal size
-        rng = np.random.default_rng([*seed, epoch, part + 1])  # + 1: NumPy drops a trailing 0
+        rng = np.random.default_rng([*seed, epoch, part + 1])  # a trailing 0 repeats order's seed
         return training_batch(geometry, motions, pairs[chosen], config, rng, device)
 
     with ThreadPoolExecutor(1) as thread:
