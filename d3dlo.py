@@ -317,7 +317,7 @@ class FlowEmbedding(nn.Module):
 
 
 class D3DLO(nn.Module):
-    """The network of Fig. 1 and Table 1, with 61,290 parameters."""
+    """The network of Fig. 1 and Table 1; 61,290 parameters with the default Config."""
 
     # Section 3.2: the output is a translation in metres and Euler angles in degrees. `encode` turns
     # motions (...,4,4) into such vectors (...,6), `decode` is its inverse.
@@ -560,7 +560,10 @@ class Training:
 
     @contextmanager
     def kept(self):
-        """Store a checkpoint whatever ends the block, unless it ends in the middle of a step."""
+        """Store a checkpoint when an exception ends the block between two steps.
+
+        A loss that is not finite stores nothing and raises ValueError.
+        """
         try:
             yield
         except FloatingPointError as error:
@@ -655,7 +658,7 @@ def accumulate(motions):
 
 
 def predict(net, scans, p, q, device):
-    """Records of scans (C,) and index arrays p, q (B,) -> T_pq (B,4,4), one forward pass each."""
+    """Records of scans (C,) and index arrays p, q (B,) -> T_pq (B,4,4), in one forward pass."""
     y_hat = net(make_batch(scans, p, q, net.config, device)).cpu().numpy()
     if not np.isfinite(y_hat).all():
         raise ValueError("the prediction is not finite; are the intensities between 0 and 1?")
@@ -728,13 +731,15 @@ class Odometry:
         record = scan_geometry(scan, self.net.config)
         if record["broken"]:
             warnings.warn(f"dropped {record['broken']} {BROKEN}", stacklevel=2)
-        if self.seen and (shift := kitti.domain_shift(record["stats"], self.seen)):
-            warnings.warn(f"{UNLIKE}: {shift}", stacklevel=2)
-            self.seen = None  # warn once
+        pose = self.pose
         if self.last is not None:
             pair = np.stack([self.last, record])
             motion, = predict_motions(self.net, pair, self.device, refine=self.refine)
-            self.pose = self.pose @ motion
+            pose = pose @ motion
+        if self.seen and (shift := kitti.domain_shift(record["stats"], self.seen)):
+            warnings.warn(f"{UNLIKE}: {shift}", stacklevel=2)
+            self.seen = None  # warn once
+        self.pose = pose
         self.last = record
         return self.pose.copy()
 
@@ -991,7 +996,7 @@ def zip_for_server(out):
 # ------------------------------------------------------------------------------------------------
 # 7  Faster versions of functions of parts 2 and 3
 #
-# Nothing here changes a result: tests prove every function equal to its plain form. A CPU spends
+# Tests check that every function equals its plain form, up to rounding. A CPU spends
 # most of its time on memory traffic, so the functions for it avoid large arrays.
 
 CHUNK = 192  # points in a chunk; 128 to 256 are about as fast
