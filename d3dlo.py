@@ -7,24 +7,25 @@ Read this file beside the paper, from top to bottom:
     2  Sampling and grouping    sections 3.3.2 and 3.3.3; NumPy, as nothing is learned here
     3  The network              section 3.3, eqs. 3 and 4, Fig. 1; PyTorch
     4  Training                 eq. 2 and section 4
-    5  Odometry                 eq. 1
-    6  Evaluation               section 5
-    7  Faster versions of functions of parts 2 and 3, with the same results. The code calls these;
-       to understand the method, read parts 2 and 3.
-    8  The command line
+    5  Weights files and devices
+    6  Odometry                 eq. 1
+    7  Evaluation               section 5
+    8  Faster versions of functions in parts 2 and 3. The code calls these, but they return the
+       same results. To understand the method, read parts 2 and 3.
+    9  The command line
 
-kitti.py converts motions to the vectors of section 3.2 (`to_vector`), finds the ground plane of
-section 4, and loads or simulates the data. metrics.py holds E_t and E_r, eqs. 6 to 8. What the
-paper tried and left out (eq. 5, quaternions, uncertainty weighting, multi-scale grouping) is in
-benchmarks/experiments.py. docs/paper-differences.md lists where we differ from the paper.
+kitti.py converts motions to the vectors of section 3.2 (`to_vector`), removes the ground plane
+(section 4), and loads or simulates the data. metrics.py computes E_t and E_r, eqs. 6 to 8. What
+the paper tried and rejected (eq. 5, quaternions, uncertainty weighting, multi-scale grouping) is
+in benchmarks/experiments.py. docs/paper-differences.md lists the differences from the paper.
 
 Frame: Velodyne, x forward, y left, z up, in metres. T_ab maps points from frame b to frame a;
 T_pq is the paper's T_{t,t+1}. Shapes: N points of a scan, S centroids, k neighbours, c features,
 C scans in a batch, B pairs of them; n1, n2, n3 are n_fps of SA1, SA2, SA3.
 
-    python d3dlo.py train                       # simulated city, a quarter of an hour on a CPU
-    python d3dlo.py train --data ROOT           # KITTI odometry, the paper's schedule
-    python d3dlo.py eval --data ROOT            # with the weights beside this file
+    python d3dlo.py train                       # on a simulated city; 15 minutes on a CPU
+    python d3dlo.py train --data ROOT           # on KITTI odometry, with the paper's settings
+    python d3dlo.py eval --data ROOT            # with the pretrained weights
 """
 import argparse
 import copy
@@ -123,15 +124,15 @@ def check_config(config):
     widths = [sa1.mlp, fe.mlp, sa2.mlp, sa3.mlp, config.mpn.mlp, mlp]
     require(all(positive(sa.r) for sa in (sa1, sa2, sa3)), "every radius must be positive")
     require(all(whole(sa.n_fps, 65535) for sa in (sa1, sa2, sa3)), "n_fps must be 1 to 65,535")
-    require(sa1.n_fps >= sa2.n_fps >= sa3.n_fps, "n_fps must not grow from layer to layer")
+    require(sa1.n_fps >= sa2.n_fps >= sa3.n_fps, "n_fps must not increase from layer to layer")
     require(all(whole(x.n_n, 1024) for x in (sa1, fe, sa2, sa3)), "n_n must be 1 to 1,024")
     require(all(len(w) > 1 and all(map(whole, w)) for w in widths), "an MLP needs 2 layers or more")
     require(mlp[-1] == 6, "the last width of mlp must be 6: translation and angles")
     require(config.max_range is None or positive(config.max_range), "max_range must be positive")
-    require(whole(config.epochs) and whole(config.batch), "epochs and batch must be whole numbers")
+    require(whole(config.epochs) and whole(config.batch), "epochs and batch must be 1 or more")
     require(positive(config.lr), "lr must be positive")
     require(config.frozen == 0 or positive(config.frozen) and config.frozen < 1,
-            "frozen must be a fraction, from 0 to below 1")
+            "frozen must be at least 0 and below 1")
     require(isinstance(config.plane, bool) and isinstance(config.augment, bool),
             "plane and augment must be True or False")
     require(config.optimizer in ("adam", "muon"), "optimizer must be adam or muon")
@@ -170,14 +171,14 @@ def group_ball(xyz: np.ndarray, centroids: np.ndarray, r: float, n_n: int, tree=
     """The neighbours i of each centroid j in eq. 3: the nearest n_n points with |x_i - x'_j| <= r.
 
     xyz (N,3) in metres, centroids (S,) indices into xyz -> (S,n_n) indices, nearest first. The
-    first one is the centroid itself, so no ball is empty. Where there are fewer than n_n, the rest
-    is filled with the centroid. These copies do not change the maximum in eq. 3, but they count in
-    the statistics of batch normalisation. `tree`: a cKDTree of xyz, if one has been built.
+    first one is the centroid itself, so no ball is empty. Missing neighbours are filled with the
+    centroid. These copies leave the maximum in eq. 3 unchanged but do affect the statistics of
+    batch normalisation. `tree`: a cKDTree of xyz, if there is one already.
     """
     ranks = [*range(1, n_n + 1)]  # a list keeps the result two-dimensional for n_n = 1
     inclusive = np.nextafter(r, np.inf)  # scipy's bound is exclusive
     _, idx = (tree or cKDTree(xyz)).query(xyz[centroids], ranks, distance_upper_bound=inclusive)
-    return np.where(idx < len(xyz), idx, centroids[:, None])  # scipy marks a missing one by N
+    return np.where(idx < len(xyz), idx, centroids[:, None])  # scipy returns N if missing
 
 
 def group_knn(xyz: np.ndarray, query: np.ndarray, k: int) -> np.ndarray:
@@ -191,7 +192,7 @@ def group_knn(xyz: np.ndarray, query: np.ndarray, k: int) -> np.ndarray:
 
 
 def geometry_dtype(config):
-    """The record of a scan: what the network needs, and what is reported about it."""
+    """The record of a scan: the network's input, and what is reported about the scan."""
     n1, n2, n3 = config.sa1.n_fps, config.sa2.n_fps, config.sa3.n_fps
     return np.dtype([
         ("xyz", "f4", (n1, 3)),  # centroids of SA1; the first n2 are SA2's, the first n3 SA3's
@@ -204,11 +205,12 @@ def geometry_dtype(config):
 
 
 def scan_geometry(scan: np.ndarray, config: Config = Config()) -> np.ndarray:
-    """Sampling and grouping of all three set abstractions: scan (N,4) -> `geometry_dtype` record.
+    """Sample and group a scan for all three set abstractions: (N,4) -> `geometry_dtype` record.
 
-    Nothing is learned here, so it is done once for every scan and kept. One sampling serves all
-    layers: SA2 samples SA1's centroids, which are in the order of sampling already, so it picks the
-    first n2 of them; SA3 picks the first n3. ValueError when too few points are usable.
+    scan: x, y, z [m] in the Velodyne frame, and intensity 0 to 1. Nothing is learned here, so the
+    record is computed once for every scan and kept. One sampling serves all layers: SA1's centroids
+    are in sampling order, so SA2's centroids are the first n2 of them, and SA3's the first n3.
+    Raises ValueError if too few points are usable.
     """
     sa1, sa2, sa3 = config.sa1, config.sa2, config.sa3
     scan, broken = kitti.usable_points(scan, config.max_range, config.plane)
@@ -218,7 +220,7 @@ def scan_geometry(scan: np.ndarray, config: Config = Config()) -> np.ndarray:
                          f"{'' if config.plane else ', off the ground'}), but the network needs "
                          f"{sa1.n_fps}; are the coordinates in metres?")
     cloud = np.ascontiguousarray(scan[:, :3])
-    centroids, tree = sample_and_index(cloud, sa1.n_fps)  # fps_textbook(...), cKDTree(cloud)
+    centroids, tree = sample_and_index(cloud, sa1.n_fps)  # fps_textbook and cKDTree
     neighbours = group_ball(cloud, centroids, sa1.r, sa1.n_n, tree)  # (n1,k1)
 
     out = np.zeros((), geometry_dtype(config))
@@ -248,8 +250,8 @@ class Batch(NamedTuple):
 
 
 def make_batch(scans, p, q, config, device="cpu"):
-    """Records of scans (C,) and index arrays p, q (B,) -> Batch."""
-    indices = (scans[name].astype(np.int64) for name in ("idx_sa2", "idx_sa3"))  # torch's type
+    """Records of scans (C,) and index arrays p, q (B,) -> Batch. Torch needs int64 indices."""
+    indices = (scans[name].astype(np.int64) for name in ("idx_sa2", "idx_sa3"))
     arrays = scans["xyz"], scans["group_sa1"], *indices, p, q
     xyz, *others = (to_device(array, device) for array in arrays)
     idx_fe = neighbours_in_q(xyz, p, q, config.fe.n_n)  # `group_knn` for every pair
@@ -320,7 +322,7 @@ class D3DLO(nn.Module):
     """The network of Fig. 1 and Table 1; 61,290 parameters with the default Config."""
 
     # Section 3.2: the output is a translation in metres and Euler angles in degrees. `encode` turns
-    # motions (...,4,4) into such vectors (...,6), `decode` is its inverse.
+    # motions (...,4,4) into such vectors (...,6). `decode` is its inverse.
     encode, decode = staticmethod(to_vector), staticmethod(from_vector)
 
     def __init__(self, config: Config = Config()):
@@ -338,7 +340,7 @@ class D3DLO(nn.Module):
     def forward(self, batch: Batch) -> torch.Tensor:
         """Batch -> y_hat (B,6): [tx, ty, tz] in metres, [roll, pitch, yaw] in degrees, of T_pq."""
         p, q = batch.p, batch.q
-        # SA1 for every scan, eq. 3. Its inputs [f_i, x_i - x'_j] come gathered: scan_geometry.
+        # SA1 for every scan, eq. 3. scan_geometry has gathered its inputs [f_i, x_i - x'_j].
         features = self.sa1.mpn(batch.group_sa1)  # (C,1024,32)
         # FE for every pair, eq. 4. (index_select has a faster backward pass than [p].)
         x, f = batch.xyz[p], features.index_select(0, p)  # (B,1024,3), (B,1024,32) of P
@@ -356,17 +358,19 @@ class D3DLO(nn.Module):
 # ------------------------------------------------------------------------------------------------
 # 4  Training: eq. 2 and section 4
 
+STORE_EVERY = 300.0  # seconds between two checkpoints
+
 
 class UnweightedLoss(nn.Module):
     """Eq. 2: the mean absolute error of all six outputs, metres and degrees alike."""
 
     def forward(self, y_hat, y):
-        """(B,6), (B,6) -> ()."""
+        """Predictions and targets (B,6), (B,6) -> the loss ()."""
         return (y - y_hat).abs().mean()
 
 
 def move_scans(scans, T):
-    """Apply T (C,4,4), rigid motions or mirrors, to the points of records of scans (C,).
+    """Apply rigid motions or mirrors T (C,4,4) to the points of the records of C scans.
 
     Distances do not change, so sampling and grouping stay valid.
     """
@@ -450,7 +454,10 @@ def batches(geometry, motions, config, seed, start, stop, device="cpu"):
 
 
 def make_optimizers(net, objective):
-    """Adam, as in section 4; with "muon" Adam and Muon, whose steps are scaled to those of Adam."""
+    """Adam, as in section 4. With "muon", the hidden matrices get Muon and all others Adam.
+
+    Muon's steps are scaled to the size of Adam's, so both use the same learning rate.
+    """
     config, parameters = net.config, [*net.parameters(), *objective.parameters()]
     if config.optimizer == "adam":
         return [torch.optim.Adam(parameters, config.lr)]
@@ -464,15 +471,16 @@ def make_scheduler(optimizer, config, steps):
     """Learning rate decays at epochs 300 and 400 of 500 (section 4), or PyTorch's one-cycle."""
     if config.schedule == "one-cycle":
         return torch.optim.lr_scheduler.OneCycleLR(optimizer, config.lr, total_steps=steps)
-    decays = [max(1, steps * 3 // 5), max(1, steps * 4 // 5)]
+    decays = [max(1, steps * 3 // 5), max(1, steps * 4 // 5)]  # 300/500 and 400/500
     return torch.optim.lr_scheduler.MultiStepLR(optimizer, decays, gamma=0.1)
 
 
 class Training:
     """A training run (section 4): a network, its optimisers, and the files in RUN.
 
-    geometry: a list of records (n,), motions: a list of T_{t,t+1} (n-1,4,4), one for each sequence;
-    objective: a module (y_hat, y) -> loss, eq. 2 by default; facts: stored with the weights.
+    geometry and motions: two lists with an entry for each sequence, records (n,) and T_{t,t+1}
+    (n-1,4,4). objective: a module (y_hat, y) -> loss, by default eq. 2. facts: values to store with
+    the weights, see `training_facts`.
     """
 
     def __init__(self, net, geometry, motions, run, seed=0, device="cpu", objective=None, **facts):
@@ -482,30 +490,35 @@ class Training:
         self.geometry, self.motions, self.seed = geometry, motions, seed
         self.run, self.facts = Path(run), facts
         self.per_epoch = steps_per_epoch(motions, self.config)
-        self.total = self.config.epochs * self.per_epoch
-        self.frozen_from = round(self.total * (1 - self.config.frozen))
-        self.step, self.losses, self.between_steps = 0, [], True
+        self.total_steps = self.config.epochs * self.per_epoch
+        self.frozen_from = round(self.total_steps * (1 - self.config.frozen))
+        self.step, self.losses = 0, []  # the losses of this epoch
+        self.between_steps = True  # False while the weights change
         self.optimizers = make_optimizers(net, self.objective)
-        self.schedulers = [make_scheduler(o, self.config, self.total) for o in self.optimizers]
+        self.schedulers = [make_scheduler(optimizer, self.config, self.total_steps)
+                           for optimizer in self.optimizers]
 
     def remaining_batches(self):
-        """The batches of the steps that are left."""
+        """Yield the batches of the remaining steps."""
         return batches(self.geometry, self.motions, self.config, (self.seed,), self.step,
-                       self.total, self.device)
+                       self.total_steps, self.device)
 
-    def examples(self):
-        """Some batches for BatchNorm's statistics, drawn with random numbers of their own."""
+    def bn_batches(self):
+        """Yield batches for recomputing BatchNorm's statistics, from another random seed."""
         return batches(self.geometry, self.motions, self.config, (self.seed, 2**31), 0,
-                       min(25, self.total), self.device)
+                       min(25, self.total_steps), self.device)
 
-    def advance(self, batch, T):
-        """One step: predict, compare, and change the weights. FloatingPointError for a bad loss."""
+    def train_step(self, batch, T):
+        """Predict, compare, and update the weights.
+
+        Raises FloatingPointError if the loss is not finite.
+        """
         self.between_steps = False
         if self.step == self.frozen_from:
-            update_bn(self.examples(), self.model)
+            update_bn(self.bn_batches(), self.model)  # uses the Batch of each pair (Batch, T)
         self.model.train(self.step < self.frozen_from)
         loss = self.objective(self.model(batch), targets(self.model, batch, T))
-        require_finite(loss.item())
+        require_finite(loss.item(), "the loss")
         self.model.zero_grad()
         self.objective.zero_grad()
         loss.backward()
@@ -516,60 +529,63 @@ class Training:
         self.step += 1
         self.between_steps = True
 
-    def usable(self):
-        """A copy of the network in eval mode, and its twin for the device.
+    def eval_copies(self):
+        """Copy the network for use, in eval mode. Returns the copy and its form for the device.
 
-        BatchNorm's running statistics lag behind the weights, so they are recomputed, unless they
-        were fixed before and the weights were trained with them. FloatingPointError when a weight
-        or a statistic is not finite.
+        BatchNorm's running statistics lag behind the weights, so they are recomputed. If they were
+        fixed, they are kept, since the weights were trained with them. Raises FloatingPointError if
+        a weight or a statistic is not finite.
         """
         net = copy.deepcopy(self.net)
-        twin = for_device(net, self.device)
+        model = for_device(net, self.device)
         if self.step <= self.frozen_from:
-            update_bn(self.examples(), twin)
-        require_finite(sum(tensor.double().sum().item() for tensor in net.state_dict().values()))
-        return net.eval(), twin.eval()
+            update_bn(self.bn_batches(), model)
+        total = sum(tensor.double().sum().item() for tensor in net.state_dict().values())
+        require_finite(total, "a weight")
+        return net.eval(), model.eval()
 
     def learning_rate(self):
         """The learning rate of the next step."""
         return self.optimizers[0].param_groups[0]["lr"]
 
-    def parts(self):
-        """Everything that training changes, by its name in a checkpoint."""
-        parts = {"model": self.net, "objective": self.objective}
+    def stateful(self):
+        """All objects with a state_dict that training changes, by their names in a checkpoint."""
+        stateful = {"model": self.net, "objective": self.objective}
         for i, (optimizer, scheduler) in enumerate(zip(self.optimizers, self.schedulers)):
-            parts |= {f"optimizer{i}": optimizer, f"scheduler{i}": scheduler}
-        return parts
+            stateful |= {f"optimizer{i}": optimizer, f"scheduler{i}": scheduler}
+        return stateful
 
     def load(self, checkpoint):
         """Continue from the content of a checkpoint."""
         self.step, self.losses = checkpoint["step"], checkpoint["losses"]
-        for name, part in self.parts().items():
+        for name, part in self.stateful().items():
             part.load_state_dict(checkpoint[name])
 
     def store_checkpoint(self):
-        """RUN/checkpoint.pt, to continue from."""
-        parts = {name: part.state_dict() for name, part in self.parts().items()}
+        """Write RUN/checkpoint.pt, from which training can continue."""
+        states = {name: part.state_dict() for name, part in self.stateful().items()}
         save(self.run / "checkpoint.pt", config=self.config.as_dict(), step=self.step,
-             losses=self.losses, **self.facts, **parts)
+             losses=self.losses, **self.facts, **states)
 
     def store_weights(self, net):
-        """RUN/weights.pt, a usable network."""
+        """Write RUN/weights.pt from a network that `eval_copies` returned."""
         save(self.run / "weights.pt", model=net.state_dict(), config=self.config.as_dict(),
              step=self.step, **self.facts)
 
     @contextmanager
-    def kept(self):
-        """Store a checkpoint when an exception ends the block between two steps.
+    def checkpoint_on_error(self):
+        """Store a checkpoint if an exception is raised in the block between two steps.
 
-        A loss that is not finite stores nothing and raises ValueError.
+        A FloatingPointError stores nothing and becomes a ValueError.
         """
         try:
             yield
         except FloatingPointError as error:
-            raise ValueError(f"{self.run}: {error} at step {self.step}, learning rate "
-                             f"{self.learning_rate():.1e}; nothing is stored since; try a lower "
-                             "learning rate") from None
+            stored = (self.run / "checkpoint.pt").exists()
+            raise ValueError(f"{self.run}: {error} at step {self.step} (learning rate "
+                             f"{self.learning_rate():.1e})"
+                             f"{'; the last checkpoint was kept' if stored else ''}. "
+                             "Try a lower learning rate") from None
         except BaseException:
             if self.between_steps:
                 self.store_checkpoint()
@@ -581,17 +597,20 @@ def targets(net, batch, T):
     return to_device(net.encode(T).astype(np.float32), batch.xyz.device)
 
 
-def require_finite(number):
-    """FloatingPointError unless a loss, or a sum of weights, is a finite number."""
+def require_finite(number, name):
+    """Raise FloatingPointError unless `number` is finite."""
     if not math.isfinite(number):
-        raise FloatingPointError("the loss or a weight is not finite")
+        raise FloatingPointError(f"{name} became non-finite")
 
 
 @torch.inference_mode()
 def mean_loss(net, objective, examples):
-    """The mean loss over `examples`, an iterable of (Batch, T). FloatingPointError as above."""
+    """The mean loss over `examples`, an iterable of (Batch, T).
+
+    Raises FloatingPointError if it is not finite.
+    """
     losses = [objective(net(batch), targets(net, batch, T)).item() for batch, T in examples]
-    require_finite(sum(losses))
+    require_finite(sum(losses), "the loss")
     return np.mean(losses)
 
 
@@ -607,53 +626,166 @@ def held_out_examples(geometry, motions, config, device):
 
 def fit(net, geometry, motions, run, seed=0, device="cpu", checkpoint=None, say=print,
         objective=None, test=None, **facts):
-    """Train `net` as `net.config` says (section 4), see `Training`. Returns a usable network.
+    """Train `net` as `net.config` says (section 4). Returns a copy of it for use.
 
-    test: geometry and motions of the test sequences, whose loss is reported after every epoch and
-    used for nothing else. Every STORE_EVERY seconds and at the end, RUN/checkpoint.pt and
-    RUN/weights.pt are written; training continues from the content of a `checkpoint`. Ctrl-C lets
-    the step under way finish. ValueError when the loss is not finite; nothing is stored then.
+    geometry, motions, run, objective, facts: see `Training`. seed: of pair order and augmentation.
+    checkpoint: the content of a checkpoint to continue from. say: called with each line to report.
+    test: geometry and motions of the test sequences. Their loss is reported after every epoch and
+    used for nothing else.
+
+    Every STORE_EVERY seconds and at the end, RUN/checkpoint.pt and RUN/weights.pt are written.
+    Ctrl-C lets the current step finish. Raises ValueError if the loss is not finite; nothing is
+    stored then.
     """
     facts = facts or training_facts({}, motions, geometry)
     training = Training(net, geometry, motions, run, seed, device, objective, **facts)
     if checkpoint:
         training.load(checkpoint)
-    left, stored = training.total - training.step, time.monotonic()
-    with kitti.delayed_interrupt() as interrupted, training.kept():
-        for batch, T in progress(training.remaining_batches(), left, "training, batches"):
+    remaining, last_stored = training.total_steps - training.step, time.monotonic()
+    with kitti.delayed_interrupt() as interrupted, training.checkpoint_on_error():
+        for batch, T in progress(training.remaining_batches(), remaining, "training, batches"):
             rate = training.learning_rate()
-            training.advance(batch, T)
+            training.train_step(batch, T)
             if training.step % training.per_epoch == 0:
                 loss, training.losses = np.mean(training.losses), []
                 epoch = training.step // training.per_epoch
                 line = f"epoch {epoch}/{net.config.epochs}: loss {loss:.4f}"
                 if test:
-                    _, twin = training.usable()
+                    _, model = training.eval_copies()
                     examples = held_out_examples(*test, net.config, device)
-                    line += f", test loss {mean_loss(twin, training.objective, examples):.4f}"
+                    line += f", test loss {mean_loss(model, training.objective, examples):.4f}"
                 say(f"{line}, learning rate {rate:.1e}")
             if interrupted:
                 raise KeyboardInterrupt(f"step {training.step} is stored; to continue: "
                                         f"python d3dlo.py train --out {run} --resume")
-            if time.monotonic() - stored > STORE_EVERY:
-                final, _ = training.usable()
+            if time.monotonic() - last_stored > STORE_EVERY:
+                trained, _ = training.eval_copies()
                 training.store_checkpoint()
-                training.store_weights(final)
-                stored = time.monotonic()
-        final, twin = training.usable()
-        loss = mean_loss(twin, training.objective, training.examples())
+                training.store_weights(trained)
+                last_stored = time.monotonic()
+        trained, model = training.eval_copies()
+        loss = mean_loss(model, training.objective, training.bn_batches())
         training.store_checkpoint()
-        training.store_weights(final)
+        training.store_weights(trained)
     say(f"training loss in eval mode: {loss:.4f}")
-    return final
+    return trained
 
 
 # ------------------------------------------------------------------------------------------------
-# 5  Odometry: eq. 1
+# 5  Weights files and devices
+
+FORMAT_VERSION = 2  # of weights files and checkpoints; increase it when the format changes
+PRETRAINED = Path(__file__).with_name("d3dlo.pt")
+
+
+def checksum(state):
+    """CRC-32 of the network's tensors and of the facts stored with them."""
+    facts = ("config", "step", "train", "before", "mean_motion", "seen")
+    text = json.dumps([state[name] for name in facts], sort_keys=True)
+    tensors = [tensor.cpu().numpy().tobytes() for tensor in state["model"].values()]
+    return zlib.crc32(b"".join([text.encode(), *tensors]))
+
+
+def save(path, **state):
+    """Write weights or a checkpoint: state_dicts and plain values. Raises OSError on failure."""
+    with metrics.replacing(path) as temporary, open(temporary, "wb") as file:
+        try:
+            torch.save({**state, "crc": checksum(state), "format": FORMAT_VERSION}, file)
+        except RuntimeError as error:  # torch raises this when the disk is full
+            reason = str(error).splitlines()[0]
+            raise OSError(f"{path}: could not be written ({reason:.80})") from None
+
+
+def load_weights(path: str | Path | None = None, network=D3DLO, checkpoint: bool = False):
+    """Read a weights file. Returns the network, in eval mode, and the content of the file, a dict.
+
+    path: the file or the folder of a training run, None for the pretrained weights. network: the
+    class of the network, which is built from the settings in the file. checkpoint: read a
+    checkpoint to continue from, not weights. Raises FileNotFoundError if there is no such file, and
+    ValueError if it is damaged or of another kind.
+    """
+    path = Path(path or PRETRAINED)
+    path = path / "weights.pt" if path.is_dir() else path
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file; give a weights.pt or the folder of a "
+                                "training run, as `python d3dlo.py train` writes them")
+    try:
+        if zipfile.ZipFile(path).testzip():  # torch does not verify the archive's checksums
+            raise ValueError("damaged")
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        if state.get("format") != FORMAT_VERSION:
+            raise ValueError(f"file format {state.get('format')}, but this version reads format "
+                             f"{FORMAT_VERSION}")
+        net = network(Config(**state["config"]))
+        net.load_state_dict(state["model"])
+        if checksum(state) != state["crc"]:
+            raise ValueError("damaged")
+    except Exception as error:  # torch and pickle raise many exception types for a bad file
+        reason = f"{type(error).__name__}: {error}".splitlines()[-1].strip()
+        raise ValueError(f"{path}: not a weights file of D3DLO ({reason:.120}); give a weights.pt "
+                         "or the folder of a training run") from None
+    if checkpoint and "losses" not in state:
+        raise ValueError(f"{path}: holds weights, but no training run to continue")
+    if not checkpoint and "losses" in state:
+        raise ValueError(f"{path}: is a checkpoint, which only training can use; give the "
+                         "weights.pt beside it")
+    return net.eval(), state
+
+
+# Devices
+
+
+def check_device(device):
+    """Raise ValueError if this PyTorch cannot use the device."""
+    try:
+        torch.empty(1, device=device).cpu()
+    except (RuntimeError, AssertionError, NotImplementedError):
+        raise ValueError(f"--device {device}: not available; use cpu, or cuda or mps if this "
+                         "PyTorch supports it") from None
+
+
+def for_device(net, device):
+    """The form of a network that runs on a device: `fast` on a CPU, elsewhere the plain one."""
+    return fast(net) if torch.device(device).type == "cpu" else net.to(device)
+
+
+def to_device(array, device):
+    """NumPy array -> tensor on a device. Copies to a GPU do not block."""
+    tensor = torch.from_numpy(np.ascontiguousarray(array))
+    if torch.device(device).type == "cuda":
+        tensor = tensor.pin_memory()
+    return tensor.to(device, non_blocking=True)
+
+
+def neighbours_in_q(xyz, p, q, k):
+    """For every pair (P, Q) the k nearest centroids of Q for each centroid of P.
+
+    Centroids xyz (C,n,3) and index arrays p, q (B,) -> (B,n,k). On a CPU by `group_knn`. On other
+    devices the search runs there, to avoid waiting for the CPU.
+    """
+    if xyz.device.type == "cpu":
+        xyz = xyz.numpy()
+        return torch.from_numpy(np.stack([group_knn(xyz[j], xyz[i], k) for i, j in zip(p, q)]))
+    return knn_by_matrix(xyz[p], xyz[q], k)
+
+
+def knn_by_matrix(x, y, k):
+    """`group_knn` by a matrix of distances: x (B,S,3), y (B,n,3) -> (B,S,k) indices into y."""
+    distances = torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist")  # accurate
+    idx = distances.topk(min(k, y.shape[1]), largest=False).indices  # (B,S,k), nearest first
+    missing = k - idx.shape[2]  # repeat the nearest when there are fewer than k points
+    return torch.cat([idx, idx[..., :1].expand(-1, -1, missing)], 2) if missing else idx
+
+
+# ------------------------------------------------------------------------------------------------
+# 6  Odometry: eq. 1
 
 
 def accumulate(motions):
-    """Eq. 1, T_{0,t+1} = T_{0,t} T_{t,t+1}: (n-1,4,4) -> (n,4,4), the first the identity."""
+    """Motions (n-1,4,4) -> poses (n,4,4) by eq. 1, T_{0,t+1} = T_{0,t} T_{t,t+1}.
+
+    The first pose is the identity.
+    """
     return np.stack([*itertools.accumulate(motions, np.matmul, initial=np.eye(4))])
 
 
@@ -702,8 +834,8 @@ def predict_motions(net, records, device="cpu", batch=16, refine=0):
     return np.concatenate(motions)
 
 
-BROKEN = "broken points (not finite, or of a range or intensity no LiDAR returns)"
-UNLIKE = "scans unlike those the weights were trained on, the poses may be wrong"
+BROKEN = "invalid points (not finite, or range or intensity out of bounds)"
+UNLIKE = "scans look unlike the training data; the poses may be wrong"
 
 
 class Odometry:
@@ -755,79 +887,23 @@ def relative_pose(scan_p: np.ndarray, scan_q: np.ndarray, weights: str | Path | 
     return odometry.register(scan_q)
 
 
-# Weights files
-
-FORMAT = 2  # of weights and checkpoints; increase it when older files cannot be read any more
-WEIGHTS = Path(__file__).with_name("d3dlo.pt")  # the weights shipped
-STORE_EVERY = 300.0  # seconds between two checkpoints of a training run
-
-
-def checksum(state):
-    """CRC-32 of the tensors of a network and of the facts stored with them."""
-    facts = ("config", "step", "train", "before", "mean_motion", "seen")
-    text = json.dumps([state[name] for name in facts], sort_keys=True)
-    tensors = [tensor.cpu().numpy().tobytes() for tensor in state["model"].values()]
-    return zlib.crc32(b"".join([text.encode(), *tensors]))
-
-
-def save(path, **state):
-    """Write weights or a checkpoint: state_dicts and plain values. OSError when that fails."""
-    with metrics.replacing(path) as temporary, open(temporary, "wb") as file:
-        try:
-            torch.save({**state, "crc": checksum(state), "format": FORMAT}, file)
-        except RuntimeError as error:  # what torch raises when the disk is full
-            reason = str(error).splitlines()[0]
-            raise OSError(f"{path}: could not be written ({reason:.80})") from None
-
-
-def load_weights(path: str | Path | None = None, network=D3DLO, checkpoint: bool = False):
-    """Weights file or folder of a training run (None: the weights shipped) -> (network, dict).
-
-    The network is built from the settings in the file and in eval mode; the dict is the file's
-    content. `checkpoint`: read a checkpoint to continue from. FileNotFoundError, ValueError.
-    """
-    path = Path(path or WEIGHTS)
-    path = path / "weights.pt" if path.is_dir() else path
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; give a weights.pt or the folder of a "
-                                "training run, as `python d3dlo.py train` writes them")
-    try:
-        if zipfile.ZipFile(path).testzip():  # torch does not verify the archive's checksums
-            raise ValueError("damaged")
-        state = torch.load(path, map_location="cpu", weights_only=True)
-        if state.get("format") != FORMAT:
-            raise ValueError(f"written by another version of D3DLO, format {state.get('format')}, "
-                             f"this one reads {FORMAT}")
-        net = network(Config(**state["config"]))
-        net.load_state_dict(state["model"])
-        if checksum(state) != state["crc"]:
-            raise ValueError("damaged")
-    except Exception as error:  # torch and pickle raise many exception types for a bad file
-        reason = f"{type(error).__name__}: {error}".splitlines()[-1].strip()
-        raise ValueError(f"{path}: not a weights file of D3DLO ({reason:.120}); give a weights.pt "
-                         "or the folder of a training run") from None
-    if checkpoint and "losses" not in state:
-        raise ValueError(f"{path}: holds weights, but no training run to continue")
-    if not checkpoint and "losses" in state:
-        raise ValueError(f"{path}: a checkpoint, for training only; give the weights.pt beside it")
-    return net.eval(), state
-
-
 # ------------------------------------------------------------------------------------------------
-# 6  Evaluation: section 5
+# 7  Evaluation: section 5
 
 BASELINES = "standing still", "mean motion of training"
+GEOMETRY_VERSION = 4  # increase it when `scan_geometry` changes, so that old caches are not read
 
 
 def load_geometry(sequences, config, cache="cache"):
-    """`scan_geometry` of all scans of a list of sequences, kept in the folder `cache`.
+    """Compute `scan_geometry` of all scans of the sequences, or read it from the folder `cache`.
 
-    Returns records (n,) and the fingerprint of the data for each sequence. ValueError for a scan
-    that `scan_geometry` refuses.
+    Returns two lists with an entry for each sequence: records (n,), and a fingerprint of the data.
+    Raises ValueError, naming the file, for a scan that `scan_geometry` refuses.
     """
     compute = functools.partial(scan_geometry, config=config)
     dtype = geometry_dtype(config)
-    depends = (GEOMETRY, config.sa1.r, config.sa2.r, config.sa3.r, config.plane, config.max_range)
+    depends = (GEOMETRY_VERSION, config.sa1.r, config.sa2.r, config.sa3.r, config.plane,
+               config.max_range)
     geometry, crcs = kitti.cached_records(sequences, compute, dtype, depends, cache)
     for s, records in zip(sequences, geometry):
         if (broken := records["broken"]).any():
@@ -836,22 +912,20 @@ def load_geometry(sequences, config, cache="cache"):
     return geometry, [kitti.fingerprint(s, crc) for s, crc in zip(sequences, crcs)]
 
 
-GEOMETRY = 4  # increase it when `scan_geometry` changes, so that old caches are not read
-
-
 def warn_about_shift(s, records, seen):
-    """Warn on stderr that scans of a sequence are unlike those in training."""
+    """Warn on stderr if scans of a sequence are unlike those in training, `seen`."""
     shifts = [kitti.domain_shift(stats, seen) for stats in records["stats"]]
     shifts = [shift for shift in shifts if shift]
     if shifts:
-        print(f"sequence {s.name}: {UNLIKE}, {len(shifts)} of {len(s)}: {shifts[0]}",
+        print(f"sequence {s.name}: {len(shifts)} of {len(s)} {UNLIKE}: {shifts[0]}",
               file=sys.stderr)
 
 
 def evaluate_sequence(net, state, s, records, out, device="cpu", refine=0):
     """Predict the trajectory of a sequence and write OUT/NN.txt, a KITTI pose file.
 
-    Returns {predictor: (segment errors, step errors)}, empty without ground truth.
+    Returns {predictor: (segment errors, step errors)} for the network and the BASELINES, which is
+    empty without ground truth.
     """
     warn_about_shift(s, records, state["seen"])
     motions = predict_motions(net, records, device, refine=refine)
@@ -869,7 +943,10 @@ def evaluate_sequence(net, state, s, records, out, device="cpu", refine=0):
 
 
 def evaluate_folder(net, state, s, out, device="cpu", refine=0, plot=False, say=print):
-    """Predict the trajectory of a `kitti.ScanFolder`: OUT/poses.txt, OUT/poses.tum, LiDAR frame."""
+    """Predict the trajectory of a `kitti.ScanFolder`, with poses in the LiDAR's frame.
+
+    Writes OUT/poses.txt, OUT/poses.tum and OUT/results.json. Returns the folder OUT.
+    """
     began = time.monotonic()
     (records,), _ = load_geometry([s], net.config)
     warn_about_shift(s, records, state["seen"])
@@ -881,7 +958,7 @@ def evaluate_folder(net, state, s, out, device="cpu", refine=0, plot=False, say=
     files, length = ["poses.txt", "poses.tum"], metrics.path_lengths(poses)[-1]
     lines = [f"{s.folder}: {len(s)} scans, path of {length:.1f} m, {rate:.1f} scans a second",
              *(f"note          {note}" for note in s.notes),
-             "frame         of the LiDAR in the first scan: x forward, y left, z up, metres",
+             "frame         LiDAR at the first scan: x forward, y left, z up, in metres",
              f"trajectory    {out}/poses.txt (KITTI pose file)",
              f"              {out}/poses.tum (t x y z qx qy qz qw, t in seconds)"]
     if plot:
@@ -895,7 +972,10 @@ def evaluate_folder(net, state, s, out, device="cpu", refine=0, plot=False, say=
 
 
 def summarize(errors, trained_on):
-    """{sequence: result of `evaluate_sequence`}, {sequence: bool} -> what results.json holds."""
+    """Average the errors of all sequences, splits and lengths, as results.json holds them.
+
+    errors: {sequence: result of `evaluate_sequence`}; trained_on: {sequence: bool}.
+    """
     def mean(names, predictor="network"):
         pairs = [errors[name][predictor] for name in names if errors[name]]
         segments, steps = [e for e, _ in pairs], [e for _, e in pairs]
@@ -911,7 +991,7 @@ def summarize(errors, trained_on):
 
 
 def results_table(results):
-    """The content of results.json as a table, with a line on units and frames."""
+    """Format the content of results.json as a table, followed by a line on units and frames."""
     def row(name, s):
         return metrics.row(name + " *" * s["trained_on"], s)
 
@@ -926,19 +1006,38 @@ def results_table(results):
             "Velodyne frame. -: no such segment, or no ground truth.")
 
 
+def evaluate_sequences(net, state, sequences, out, device, refine):
+    """Predict the trajectories of sequences and write OUT/NN.txt. Returns what `summarize` does."""
+    geometry, fingerprints = load_geometry(sequences, net.config)
+    net = for_device(net, device)
+    clear_results(out)
+    work = progress(zip(sequences, geometry), len(sequences), "registering, sequences")
+    errors = {s.name: evaluate_sequence(net, state, s, records, out, device, refine)
+              for s, records in work}
+    # Sequences are compared by content, since different data may have the same name
+    known = {*state["train"].values(), *state["before"]}
+    return summarize(errors, {s.name: f in known for s, f in zip(sequences, fingerprints)})
+
+
 def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", refine=0, plot=False,
              say=print, network=D3DLO):
-    """The command `eval`: trajectories, table and results.json of `weights` (None: shipped).
+    """Run the command `eval`: write trajectories and results.json, and print a table of errors.
 
-    data: a folder in KITTI's layout or a plain folder of scans, for which there is a trajectory
-    only; None for the simulated test and validation sequences. network: the class of the network.
-    Returns the folder of the results. ValueError, OSError.
+    data: a folder in KITTI's layout or a plain folder of scans, which gives a trajectory only; None
+    for the simulated city. weights: a weights file or the folder of a training run, None for the
+    pretrained weights. sequences: a list of names or splits; None for all of `data` or, in the
+    simulated city, the test and validation splits. out: the folder to write to, None for a new one,
+    results/TIME. device: cpu, cuda or mps. refine: see `predict_refined`. plot: draw OUT/plot.png.
+    say: called with the text to print. network: the class of the network.
+
+    Returns the folder of the results. Raises ValueError if an argument, the weights or the data are
+    invalid, and OSError if a file cannot be read or written.
     """
     check_device(device)
     check_number("refine", refine)
     net, state = load_weights(weights, network)
     if plot:
-        metrics.picture(1, 1)  # fail now, and not after the work, when it cannot be drawn
+        metrics.picture(1, 1)  # without matplotlib, fail now and not after the work
     sequences = sequences or ("all" if data else ("test", "validation"))
     root = data_root(data, sequences)
     out = kitti.new_name("results") if out is None else Path(out)
@@ -946,18 +1045,12 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     chosen = kitti.open_sequences(root, sequences)
     if isinstance(chosen[0], kitti.ScanFolder):
         return evaluate_folder(net, state, chosen[0], out, device, refine, plot, say)
-    geometry, fingerprints = load_geometry(chosen, net.config)
-    net = for_device(net, device)
-    clear_results(out)
-    work = progress(zip(chosen, geometry), len(chosen), "registering, sequences")
-    errors = {s.name: evaluate_sequence(net, state, s, records, out, device, refine)
-              for s, records in work}
-    seen = {*state["train"].values(), *state["before"]}  # by content: names may repeat
-    results = summarize(errors, {s.name: f in seen for s, f in zip(chosen, fingerprints)})
+
+    results = evaluate_sequences(net, state, chosen, out, device, refine)
     files = [f"{s.name}.txt" for s in chosen]
     lines = [f"trajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)",
              f"figures       {out}/results.json"]
-    if {f"{i}" for i in range(11, 22)} <= set(errors):  # KITTI's sequences without ground truth
+    if {f"{i}.txt" for i in range(11, 22)} <= set(files):  # KITTI's sequences without ground truth
         lines.append(f"to submit     {zip_for_server(out)}")
         files.append("kitti-server.zip")
     if plot:
@@ -965,18 +1058,18 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
         metrics.draw(out / "plot.png", T)
         lines.append(f"picture       {out}/plot.png (from above, errors by length)")
         files.append("plot.png")
-    source = {"weights": str(weights or WEIGHTS), "data": str(root), "refine": refine}
+    source = {"weights": str(weights or PRETRAINED), "data": str(root), "refine": refine}
     metrics.write_json(out / "results.json", source | results | {"files": files})
     say("\n".join([results_table(results), *lines]))
     return out
 
 
 def clear_results(out):
-    """Delete what an earlier evaluation wrote to the folder OUT, as its results.json lists it."""
+    """Delete the files of an earlier evaluation in the folder OUT, which its results.json lists."""
     try:
         content = json.loads((out / "results.json").read_text(encoding="utf-8"))
         files = [Path(name) for name in content["files"]]
-    except (OSError, ValueError, KeyError, TypeError):  # none, or not one of ours
+    except (OSError, ValueError, KeyError, TypeError):  # there is none, or it is not ours
         return
     for path in [*files, Path("results.json")]:
         if path.name == str(path) and (out / path).is_file():
@@ -984,7 +1077,7 @@ def clear_results(out):
 
 
 def zip_for_server(out):
-    """OUT/kitti-server.zip: 11.txt to 21.txt at the top, as the benchmark's server expects them."""
+    """Write OUT/kitti-server.zip, with 11.txt to 21.txt at its top level. Returns its path."""
     path = out / "kitti-server.zip"
     with metrics.replacing(path) as temporary:
         with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -994,21 +1087,22 @@ def zip_for_server(out):
 
 
 # ------------------------------------------------------------------------------------------------
-# 7  Faster versions of functions of parts 2 and 3
+# 8  Faster versions of functions in parts 2 and 3
 #
-# Tests check that every function equals its plain form, up to rounding. A CPU spends
-# most of its time on memory traffic, so the functions for it avoid large arrays.
+# Tests check that every function equals its plain form, up to rounding. On a CPU most of the time
+# goes into memory traffic, so these functions avoid large arrays.
 
 CHUNK = 192  # points in a chunk; 128 to 256 are about as fast
-# The bits of a byte spread out to every second place, for `morton_order`.
+# A byte with its bits spread out to every second place: its binary digits, read in base 4
 SPREAD_BITS = np.array([int(f"{i:b}", 4) for i in range(256)], np.uint16)
 
 
 def morton_order(xyz):
-    """(N,3) -> (N,) indices that put points close to each other next to each other.
+    """Sort points (N,3) so that close points are close in the order. Returns indices (N,).
 
-    A Z-order curve over azimuth and the logarithm of the range, in which the points of a LiDAR are
-    about evenly dense. Affects speed only, never the result of `farthest_point_sampling`.
+    The order is a Z-order curve: each point's azimuth and log range are scaled to a byte, and the
+    bits of the two bytes are interleaved. In these coordinates a LiDAR's points are about evenly
+    dense. Affects speed only, never the result of `farthest_point_sampling`.
     """
     x, y = xyz[:, 0], xyz[:, 1]
     with np.errstate(all="ignore"):
@@ -1065,61 +1159,31 @@ def sample_and_index(xyz, n):
 
 
 def fast(net):
-    """The twin of a D3DLO, or of a subclass, that is faster on a CPU.
+    """A version of a D3DLO, or of a subclass, that is faster on a CPU.
 
     It computes the same function and shares the parameters and buffers of `net`, so training one
     trains the other, and both have the same state_dict.
     """
-    shared = {id(tensor): tensor for tensor in (*net.parameters(), *net.buffers())}
-    twin = copy.deepcopy(net, shared)
-    twins = {MiniPointNet: FastMiniPointNet, SetAbstraction: FastSetAbstraction,
-             FlowEmbedding: FastFlowEmbedding}
+    # deepcopy does not copy what its memo lists, so both networks share these tensors
+    memo = {id(tensor): tensor for tensor in (*net.parameters(), *net.buffers())}
+    twin = copy.deepcopy(net, memo)
+    # The fast classes differ in their methods only, so a module can change its class
+    faster = {MiniPointNet: FastMiniPointNet, SetAbstraction: FastSetAbstraction,
+              FlowEmbedding: FastFlowEmbedding}
     for module in twin.modules():
-        module.__class__ = twins.get(type(module), type(module))
+        module.__class__ = faster.get(type(module), type(module))
     return twin
-
-
-def for_device(net, device):
-    """The network to run on a device: the fast twin on a CPU, elsewhere the plain network."""
-    return fast(net) if torch.device(device).type == "cpu" else net.to(device)
-
-
-def to_device(array, device):
-    """NumPy array -> tensor. Copies to a GPU do not block."""
-    tensor = torch.from_numpy(np.ascontiguousarray(array))
-    if torch.device(device).type == "cuda":
-        tensor = tensor.pin_memory()
-    return tensor.to(device, non_blocking=True)
-
-
-def neighbours_in_q(xyz, p, q, k):
-    """Centroids xyz (C,n,3), index arrays p, q (B,) -> (B,n,k) neighbours in Q of those of P.
-
-    `group_knn` on a CPU. On other devices the search runs there, to avoid waiting for the CPU.
-    """
-    if xyz.device.type == "cpu":
-        xyz = xyz.numpy()
-        return torch.from_numpy(np.stack([group_knn(xyz[j], xyz[i], k) for i, j in zip(p, q)]))
-    return knn_by_matrix(xyz[p], xyz[q], k)
-
-
-def knn_by_matrix(x, y, k):
-    """`group_knn` by a matrix of distances: x (B,S,3), y (B,n,3) -> (B,S,k) indices into y."""
-    distances = torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist")  # exact enough
-    idx = distances.topk(min(k, y.shape[1]), largest=False).indices  # (B,S,k), nearest first
-    missing = k - idx.shape[2]  # repeat the nearest when there are fewer than k points
-    return torch.cat([idx, idx[..., :1].expand(-1, -1, missing)], 2) if missing else idx
 
 
 class FastMiniPointNet(MiniPointNet):
     """`MiniPointNet` that takes the maximum before the last batch normalisation and ReLU."""
 
     def forward(self, f):
-        """Features f (...,k,c) -> (...,c')."""
+        """Features f (B,...,k,c) of k points -> (B,...,c')."""
         return self.after_first_linear(self.h[0](f))
 
     def after_first_linear(self, z):
-        """The output of the first linear layer z (...,k,c1) -> (...,c')."""
+        """The output z (B,...,k,c1) of the first linear layer -> (B,...,c')."""
         *hidden, linear, norm, _ = self.h[1:]
         points = z.flatten(0, -2)
         for layer in hidden:
@@ -1130,8 +1194,9 @@ class FastMiniPointNet(MiniPointNet):
 class FastSetAbstraction(SetAbstraction):
     """`SetAbstraction` that applies the first linear layer before gathering.
 
-    The layer is linear in its two parts, W [f_i, x_i - x'_j] + b = (W_f f_i + W_x x_i) +
-    (b - W_x x'_j), so it is applied to n points and S centroids instead of S k neighbours.
+    W [f_i, x_i - x'_j] + b = (W_f f_i + W_x x_i) + (b - W_x x'_j) is a sum of two terms, one for
+    the point i and one for the centroid j. So the layer is applied to n points and S centroids
+    instead of S k neighbours.
     """
 
     def forward(self, x, f, idx):
@@ -1144,7 +1209,7 @@ class FastSetAbstraction(SetAbstraction):
 
 
 class FastFlowEmbedding(FlowEmbedding):
-    """`FlowEmbedding` that applies the first linear layer before gathering, as above."""
+    """`FlowEmbedding` that applies the first linear layer before gathering, in the same way."""
 
     def forward(self, x, f, y, g, idx):
         """P: x (B,S,3), f (B,S,c); Q: y (B,n,3), g (B,n,c); idx (B,S,k) -> e (B,S,c')."""
@@ -1156,9 +1221,9 @@ class FastFlowEmbedding(FlowEmbedding):
 
 
 class GatherAdd(torch.autograd.Function):
-    """u (B,n,D), v (B,S,D), idx (B,S,k) -> u[b, idx] + v[:, :, None], (B,S,k,D).
+    """u (B,n,D), v (B,S,D), idx (B,S,k) -> gather(u, idx) + v[:, :, None], (B,S,k,D).
 
-    With its backward pass written out, which takes half as long as autograd's.
+    The backward pass is written out, which takes half as long as autograd's.
     """
 
     @staticmethod
@@ -1181,42 +1246,45 @@ class GatherAdd(torch.autograd.Function):
 class LinearMax(torch.autograd.Function):
     """h (B,S,k,D), W (D',D) -> the maximum over k of h W^T, (B,S,D').
 
-    With `moments` also E[h] (D,) and E[h^T h] (D,D) over all B S k rows, otherwise None. One
-    element of the batch at a time, so that (B,S,k,D') never exists in full. The backward pass
-    computes the product again and takes the maximum of that; equal maxima share the gradient, as
-    in torch.amax.
+    With `moments`, also returns E[h] (D,) and E[h^T h] (D,D) over all B S k rows, otherwise None.
+    The product is computed for one element of the batch at a time, so that (B,S,k,D') never exists
+    in full. The backward pass computes it again. Equal maxima share the gradient, as in torch.amax.
     """
 
     @staticmethod
     def forward(ctx, h, W, moments):
         B, S, k, D = h.shape
         out, z = h.new_empty(B, S, len(W)), h.new_empty(S * k, len(W))
-        first, second = (h.new_zeros(D), h.new_zeros(D, D)) if moments else (None, None)
+        E_h, E_hh = (h.new_zeros(D), h.new_zeros(D, D)) if moments else (None, None)
         for b, rows in enumerate(h.reshape(B, S * k, D)):
             torch.mm(rows, W.t(), out=z)
             torch.amax(z.view(S, k, -1), 1, out=out[b])
             if moments:
-                first += rows.sum(0) / (B * S * k)
-                second.addmm_(rows.t(), rows, alpha=1 / (B * S * k))
+                E_h += rows.sum(0) / (B * S * k)
+                E_hh.addmm_(rows.t(), rows, alpha=1 / (B * S * k))
         ctx.save_for_backward(h, W)
-        return out, first, second
+        return out, E_h, E_hh
 
     @staticmethod
-    def backward(ctx, grad, grad_first, grad_second):
+    def backward(ctx, grad, grad_E_h, grad_E_hh):
         h, W = ctx.saved_tensors
         B, S, k, D = h.shape
         grad_h, grad_W, z = torch.empty_like(h), torch.zeros_like(W), h.new_empty(S * k, len(W))
-        of_neighbour = z.view(S, k, -1)  # the same memory
-        if grad_first is not None:
-            constant = grad_first / (B * S * k)
-            slope = (grad_second + grad_second.t()) / (B * S * k)
+        z_by_group = z.view(S, k, -1)  # the same memory
+        if grad_E_h is not None:  # the gradient of a row h through the moments: constant + h slope
+            constant = grad_E_h / (B * S * k)
+            slope = (grad_E_hh + grad_E_hh.t()) / (B * S * k)
         for b, rows in enumerate(h.reshape(B, S * k, D)):
+            # The product, as in the forward pass
             torch.mm(rows, W.t(), out=z)
-            torch.eq(of_neighbour, of_neighbour.amax(1, keepdim=True), out=of_neighbour)  # 0 or 1
-            of_neighbour.mul_((grad[b] / of_neighbour.sum(1).clamp_(min=1))[:, None])
+            # In its place the mask of the maxima: 1 for each maximum over k, otherwise 0
+            torch.eq(z_by_group, z_by_group.amax(1, keepdim=True), out=z_by_group)
+            # In its place the gradient of the product: equal maxima get equal shares
+            z_by_group.mul_((grad[b] / z_by_group.sum(1).clamp_(min=1))[:, None])
+            # The gradients of W and h
             grad_W.addmm_(z.t(), rows)
             grad_rows = grad_h[b].view(S * k, D)
-            if grad_first is None:
+            if grad_E_h is None:
                 torch.mm(z, W, out=grad_rows)
             else:
                 torch.addmm(constant, rows, slope, out=grad_rows).addmm_(z, W)
@@ -1224,128 +1292,129 @@ class LinearMax(torch.autograd.Function):
 
 
 def linear_norm_relu_max(linear, norm, h):
-    """The maximum over k of ReLU(BN(linear(h))): h (...,k,D) -> (...,D').
+    """The maximum over k of ReLU(BN(linear(h))): h (B,...,k,D) -> (B,...,D').
 
-    ReLU never decreases, and BN increases or decreases with the sign of its scale. So the maximum
-    is taken first, of z = W h + b where the scale is positive and of -z where it is negative. BN's
-    statistics are still those of all neighbours; they follow from the moments of h:
-    mean = W E[h] + b, var = diag(W Cov[h] W^T).
+    ReLU never decreases. BN increases where its scale is positive and decreases where it is
+    negative. So the maximum can be taken first: of z = W h + b where the scale is positive, and of
+    -z where it is negative. BN's statistics are still those of all neighbours. They follow from the
+    moments of h: mean = W E[h] + b, var = diag(W Cov[h] W^T).
     """
     sign = torch.where(norm.weight < 0, -1.0, 1.0).to(h)
     W, b = sign[:, None] * linear.weight, sign * linear.bias
     groups = h.reshape(len(h), -1, *h.shape[-2:])  # (B,S,k,D)
-    z, first, second = LinearMax.apply(groups, W, norm.training)
-    z = z.reshape(*h.shape[:-2], -1) + b  # (...,D')
+    z, E_h, E_hh = LinearMax.apply(groups, W, norm.training)
+    z = z.reshape(*h.shape[:-2], -1) + b  # (B,...,D')
     if norm.training:
         n = h[..., 0].numel()
-        mean = W @ first + b
-        var = ((W @ (second - first[:, None] * first)) * W).sum(1).clamp(min=0)
+        mean = W @ E_h + b
+        var = ((W @ (E_hh - E_h[:, None] * E_h)) * W).sum(1).clamp(min=0)
         with torch.no_grad():  # the running statistics, as nn.BatchNorm1d updates them
             norm.num_batches_tracked.add_(1)
-            share = 1 / norm.num_batches_tracked.item() if norm.momentum is None else norm.momentum
-            norm.running_mean.lerp_(sign * mean, share)
-            norm.running_var.lerp_(var * n / (n - 1), share)
+            momentum = norm.momentum
+            if momentum is None:  # the running statistics are means over all batches
+                momentum = 1 / norm.num_batches_tracked.item()
+            norm.running_mean.lerp_(sign * mean, momentum)
+            norm.running_var.lerp_(var * n / (n - 1), momentum)
     else:
         mean, var = sign * norm.running_mean, norm.running_var
     return F.relu((z - mean) * (norm.weight.abs() * torch.rsqrt(var + norm.eps)) + norm.bias)
 
 
 # ------------------------------------------------------------------------------------------------
-# 8  The command line
+# 9  The command line
 
-SIMULATED = Path("data/simulated")  # the city made when no --data is given
-
-
-def check_device(device):
-    """ValueError when this PyTorch cannot use the device."""
-    try:
-        torch.empty(1, device=device).cpu()
-    except (RuntimeError, AssertionError, NotImplementedError):
-        raise ValueError(f"--device {device}: not available here; use cpu, or cuda or mps where "
-                         "PyTorch has them") from None
+SIMULATED = Path("data/simulated")  # the simulated city, used without --data
 
 
 def check_number(name, value):
-    """ValueError unless a value is a whole number, 0 or more, that fits in 64 bits."""
+    """Raise ValueError unless a value is a non-negative integer of at most 63 bits."""
     if not isinstance(value, int) or not 0 <= value < 2**63:
-        raise ValueError(f"{name} is {value!r}, but must be a whole number, 0 or more")
+        raise ValueError(f"{name} must be a non-negative integer, not {value!r}")
 
 
 def check_output(path, root):
-    """ValueError when results would be written among the data, where they could replace some."""
+    """Raise ValueError if results would be written among the data, which they could overwrite."""
     path, root = Path(path).resolve(), Path(root).resolve()
     if path == root or any(path.is_relative_to(root / name) for name in ("sequences", "poses")):
-        raise ValueError(f"--out {path}: the data are there; choose another folder")
+        raise ValueError(f"--out {path} is inside the data folder; choose another folder")
 
 
 def data_root(data, names, whole=False):
-    """The folder `data` or, without one, the simulated city, made as far as it is needed.
+    """The folder `data` or, if it is None, that of the simulated city.
 
-    names: the sequences needed; whole: all of them. ValueError for a sequence it does not have.
+    Missing sequences of the city are simulated: those in `names`, or all if `whole`. Raises
+    ValueError for a name that the city does not have.
     """
     names = [names] if isinstance(names, str) else names or ()
     if data:
         return Path(data)
     if unknown := set(names) - {"all", *SPLITS, *sum(SPLITS.values(), ())}:
-        raise ValueError(f"the simulated city has no sequence {' '.join(sorted(unknown))}: there "
-                         f"are 00 to 10, {', '.join(SPLITS)}, and all")
+        raise ValueError(f"the simulated city has no sequence {' '.join(sorted(unknown))}; "
+                         f"available: 00 to 10, {', '.join(SPLITS)}, all")
     return kitti.simulate(SIMULATED, sequences="all" if whole else names)
 
 
 def choose_sequences(root, names=None):
-    """Two lists of `Sequence`: those to train on, and those of the test and validation splits.
+    """Open the sequences to train on, and those of the test and validation splits. Two lists.
 
-    names: None for the training split or, where there is none of it, everything that is in no
-    split. ValueError when there is nothing to train on.
+    names: sequences or splits to train on. None for the training split or, if `root` has nothing of
+    it, for all sequences outside the test and validation splits. Raises ValueError if there is
+    nothing to train on.
     """
-    there, held_out = kitti.sequence_names(root), SPLITS["test"] + SPLITS["validation"]
-    names = (names or [n for n in SPLITS["train"] if n in there]
-             or [n for n in there if n not in held_out])
+    available, held_out = kitti.sequence_names(root), SPLITS["test"] + SPLITS["validation"]
+    names = (names or [n for n in SPLITS["train"] if n in available]
+             or [n for n in available if n not in held_out])
     if not names:
-        raise ValueError(f"{root}: holds only test and validation sequences, {' '.join(there)}; "
-                         "choose those to train on by --sequences")
+        raise ValueError(f"{root}: holds only test and validation sequences, "
+                         f"{' '.join(available)}; choose those to train on with --sequences")
     chosen = kitti.open_sequences(root, names)
-    taken = [s.name for s in chosen]
+    chosen_names = [s.name for s in chosen]
     if not sum(len(s) - 1 for s in chosen):
-        raise ValueError(f"{root}: sequence {' '.join(taken)} has one scan; training needs pairs")
-    others = [n for n in held_out if n in there and n not in taken]
+        raise ValueError(f"{root}: sequence {' '.join(chosen_names)} has one scan; training needs "
+                         "at least two scans")
+    others = [n for n in held_out if n in available and n not in chosen_names]
     return chosen, kitti.open_sequences(root, others)
 
 
 def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu", resume=False,
           weights=None, network=D3DLO, objective=None):
-    """The command `train`: train on `sequences` of `data`, then evaluate what was held out.
+    """Run the command `train`: train a network, then evaluate it on the held-out sequences.
 
-    config: None for the paper's settings or, without data, the short recipe; data: a folder in
-    KITTI's layout, None for the simulated city; weights: start from these and keep their network
-    and input; network, objective: a subclass of D3DLO and a loss, see `fit`. Returns the run's
-    folder. ValueError, OSError.
+    config: a Config; None for the paper's settings or, in the simulated city, the short recipe.
+    data: a folder in KITTI's layout, None for the simulated city. sequences: a list of names or
+    splits to train on, None for the training split. out: the folder RUN, None for a new one,
+    runs/TIME. seed: random seed for initialisation, pair order and augmentation. device: cpu, cuda
+    or mps. resume: continue the training run in `out` with the arguments it was started with;
+    config, data, sequences, seed and weights are then ignored. weights: start from these weights
+    and keep their network and input settings. network, objective: a subclass of D3DLO and a loss,
+    see `Training`.
+
+    Returns RUN. Raises ValueError if an argument or the data are invalid or the loss is not finite,
+    and OSError if a file cannot be read or written.
     """
     check_device(device)
     check_number("seed", seed)
     run = kitti.new_name("runs") if out is None else Path(out)
     check_output(run, data or SIMULATED)
     with kitti.run_folder(run):
-        config = config or Config(**({} if data else SHORT))
         if resume:
             config, data, sequences, seed, weights = read_run(run)
         elif (run / "config.json").exists():
             raise ValueError(f"{run}: holds a training run; add --resume to continue it, or choose "
                              "another --out")
+        config = config or config_from({"data": data})
         data, weights = (path and str(Path(path).resolve()) for path in (data, weights))
-        net, checkpoint, before = starting_point(run, resume, weights, config, network, seed)
+        net, checkpoint, earlier = starting_point(run, resume, weights, config, network, seed)
         root = data_root(data, sequences, whole=True)
         chosen, held_out = choose_sequences(root, sequences)
-        names, motions = [s.name for s in chosen], [s.motions() for s in chosen]
+        motions = [s.motions() for s in chosen]
         per_epoch = steps_per_epoch(motions, net.config)
-        # Held-out scans too, so that a broken one is found now and not after the training
-        geometry, fingerprints = load_geometry(chosen + held_out, net.config)
-        test = test_data(held_out, geometry[len(chosen):])
-        geometry, fingerprints = geometry[:len(chosen)], dict(zip(names, fingerprints))
+        geometry, fingerprints, test = training_geometry(chosen, held_out, net.config)
         if checkpoint and checkpoint["train"] != fingerprints:
             raise ValueError(f"{run}: the data have changed since this training run started; "
                              "resume it with the data it was started with")
-        facts = training_facts(fingerprints, motions, geometry, before)
+        facts = training_facts(fingerprints, motions, geometry, **earlier)
+        names = list(fingerprints)
         arguments = dict(data=data, sequences=names, seed=seed, device=device, weights=weights)
         write_run(run, arguments, net.config)
 
@@ -1354,17 +1423,36 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
         say(f"{parameters:,} parameters, {pairs:,} pairs of scans of {' '.join(names)}, "
             f"{net.config.epochs} epochs of {per_epoch} batches -> {run}")
         if not sequences and (missing := set(SPLITS["train"]) - set(names)):
-            say(f"of the training split {' '.join(sorted(missing))} are missing")
+            say(f"missing from the training split: {' '.join(sorted(missing))}")
         fit(net, geometry, motions, run, seed, device, checkpoint, say, objective, test, **facts)
         if held_out:
-            names = [s.name for s in held_out]
-            try:
-                evaluate(root, run, names, run / "results", device, say=say, network=network)
-            except KeyboardInterrupt:
-                raise KeyboardInterrupt(f"the weights are complete: {run}/weights.pt") from None
+            evaluate_held_out(root, run, held_out, device, say, network)
         say(f"weights       {run}/weights.pt\n"
             f"next          python d3dlo.py eval --weights {run}{f' --data {data}' * bool(data)}")
     return run
+
+
+def training_geometry(chosen, held_out, config):
+    """Load the records of the sequences to train on, and the data for the test loss.
+
+    Returns a list of records (n,), {name: fingerprint of the data}, and geometry and motions of the
+    test split's sequences, () without any. The scans of all held-out sequences are read, so that an
+    unusable one is found now and not after the training.
+    """
+    geometry, fingerprints = load_geometry(chosen + held_out, config)
+    test = [(records, s.motions()) for records, s in zip(geometry[len(chosen):], held_out)
+            if s.name in SPLITS["test"] and s.poses is not None and len(s) > 1]
+    names = [s.name for s in chosen]
+    return geometry[:len(chosen)], dict(zip(names, fingerprints)), tuple(zip(*test))
+
+
+def evaluate_held_out(root, run, held_out, device, say, network):
+    """Evaluate the weights of a training run on the held-out sequences, into RUN/results."""
+    names = [s.name for s in held_out]
+    try:
+        evaluate(root, run, names, run / "results", device, say=say, network=network)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"the weights are complete: {run}/weights.pt") from None
 
 
 def print_and_log(log, line):
@@ -1374,54 +1462,49 @@ def print_and_log(log, line):
     print(line, flush=True)
 
 
-def test_data(held_out, geometry):
-    """Geometry and motions of the test split's sequences with ground truth, () without any."""
-    test = [(records, s.motions()) for records, s in zip(geometry, held_out)
-            if s.name in SPLITS["test"] and s.poses is not None and len(s) > 1]
-    return tuple(zip(*test))
-
-
 def starting_point(run, resume, weights, config, network, seed):
-    """What training begins with: a network, a checkpoint or None, and facts about earlier data.
+    """What training starts from: the run's checkpoint, other weights, or random weights.
 
-    That is the checkpoint of the run, or other weights, whose network and input are kept, or a new
-    network.
+    Returns the network, the content of the checkpoint or None, and what `training_facts` must know
+    about earlier training data. The network of other weights keeps its input settings.
     """
     stored = run / "checkpoint.pt"
     if resume and stored.exists():
         net, checkpoint = load_weights(stored, network, checkpoint=True)
-        return net, checkpoint, checkpoint | {"train": {}}
+        return net, checkpoint, {"before": checkpoint["before"], "seen": checkpoint["seen"]}
     if weights:
         net, state = load_weights(weights, network)
         net.config = replace(net.config, **{name: getattr(config, name) for name in TRAINING})
-        return net, None, state
+        before = [*state["before"], *state["train"].values()]
+        return net, None, {"before": before, "seen": state["seen"]}
     torch.manual_seed(seed)
-    return network(config), None, None
+    return network(config), None, {}
 
 
-def training_facts(fingerprints, motions, geometry, before=None):
-    """What a weights file keeps about its training data: fingerprints, mean motion, statistics.
+def training_facts(fingerprints, motions, geometry, before=(), seen=()):
+    """Summarise the training data: what a weights file stores about them.
 
-    before: the facts of the weights that training started from, which are kept as well.
+    Fingerprints {name: fingerprint}, motions and geometry describe the data of this training run.
+    before, seen: the fingerprints and the range of the scan statistics of earlier training data,
+    if training starts from other weights.
     """
-    before = before or {"train": {}, "before": [], "seen": []}
     stats = [records["stats"] for records in geometry]
-    stats = np.concatenate([*stats, np.reshape(before["seen"], (-1, len(kitti.STATS)))])
+    stats = np.concatenate([*stats, np.reshape(seen, (-1, len(kitti.STATS)))])
     return {"train": fingerprints,
-            "before": sorted({*before["before"], *before["train"].values()}),
+            "before": sorted(set(before)),
             "mean_motion": to_vector(np.concatenate(motions)).mean(0).tolist(),
             "seen": [stats.min(0).tolist(), stats.max(0).tolist()]}
 
 
 def write_run(run, arguments, config):
-    """RUN/config.json: all that is needed to repeat a training run, or to resume it."""
+    """Write RUN/config.json: everything needed to repeat or resume a training run."""
     versions = kitti.versions(Path(__file__).parent) | {"d3dlo": __version__}
     content = {"arguments": arguments, "config": config.as_dict(), "versions": versions}
     metrics.write_json(run / "config.json", content)
 
 
 def read_run(run):
-    """RUN/config.json -> Config, data, sequences, seed and weights of a training run."""
+    """Read RUN/config.json. Returns Config, data, sequences, seed and weights of the run."""
     try:
         content = json.loads((run / "config.json").read_text(encoding="utf-8"))
         config, arguments = Config(**content["config"]), content["arguments"]
@@ -1434,20 +1517,25 @@ def read_run(run):
             raise ValueError("damaged")
     except (ValueError, KeyError, TypeError, AttributeError, OSError):
         raise ValueError(f"{run}/config.json: missing or damaged, so there is no training run to "
-                         "resume; name its folder by --out") from None
+                         "resume; give its folder with --out") from None
     return config, data, sequences, seed, weights
 
 
 def command_line(argv):
-    """Arguments -> {option: value} of those that were given; the functions hold the defaults."""
-    how = dict(formatter_class=argparse.RawDescriptionHelpFormatter,
-               argument_default=argparse.SUPPRESS)
-    title, *_, examples = __doc__.split("\n\n")
-    parser = argparse.ArgumentParser(prog="d3dlo", description=f"{title}\n\n{examples}", **how)
+    """Parse the arguments. Returns {option: value} of the options given.
+
+    `train` and `evaluate` hold the defaults of all others.
+    """
+    settings = dict(formatter_class=argparse.RawDescriptionHelpFormatter,
+                    argument_default=argparse.SUPPRESS)
+    parser = argparse.ArgumentParser(prog="d3dlo", **settings, description=(
+        "D3DLO: Deep 3D LiDAR Odometry. Train the network and evaluate it.\n"
+        "`train --help` and `eval --help` show all options, with examples."))
     parser.add_argument("--version", action="version", version=f"d3dlo {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="train | eval")
     train_options(commands.add_parser(
-        "train", **how, help="train, then evaluate on the test and validation splits", description=(
+        "train", help="train, then evaluate on the test and validation splits", **settings,
+        description=(
             "Train D3DLO, then evaluate it on the test and validation splits.\n\n"
             "  python d3dlo.py train\n"
             "  python d3dlo.py train --data ROOT\n"
@@ -1455,7 +1543,7 @@ def command_line(argv):
             "  python d3dlo.py train --data ROOT --weights d3dlo.pt --short --lr 0.002\n"
             "  python d3dlo.py train --out RUN --resume")))
     eval_options(commands.add_parser(
-        "eval", **how, help="predict trajectories and print KITTI's errors", description=(
+        "eval", **settings, help="predict trajectories and print KITTI's errors", description=(
             "Predict the trajectories of sequences, write them and print KITTI's errors.\n"
             "A plain folder of scans (*.bin or *.npy) gives a trajectory only.\n\n"
             "  python d3dlo.py eval\n"
@@ -1465,21 +1553,21 @@ def command_line(argv):
     return vars(parser.parse_args(argv))
 
 
-def data_options(command, layouts):
-    """The options that both commands have."""
+def data_options(command, layouts, default):
+    """Add the options of both commands. default: a description of that of --sequences."""
     add = command.add_argument_group("data").add_argument
     add("--data", metavar="ROOT", help=(
         f"{layouts} (default: a simulated city, made in {SIMULATED})"))
     add("--sequences", nargs="+", metavar="NN", help=(
-        "names, or splits: train, test, validation, all"))
+        f"names, or splits: train, test, validation, all (default: {default})"))
 
 
 def train_options(command):
-    """The options of `train`."""
-    data_options(command, "folder in KITTI odometry layout")
+    """Add the options of `train`."""
+    data_options(command, "folder in KITTI odometry layout", "the training split")
     add = command.add_argument_group("network").add_argument
     add("--weights", metavar="FILE|RUN", help=(
-        "start from these weights and keep their network and input"))
+        "start from these weights and keep their network and input settings"))
     add("--neighbors", type=int, metavar="N", help=(
         f"n_n of the first set abstraction, Table 2 (default: {Config.sa1.n_n})"))
     add("--no-plane", action="store_false", dest="plane", help=(
@@ -1490,11 +1578,12 @@ def train_options(command):
         "directions, Muon, one-cycle learning rate, augmentation, fixed BatchNorm statistics at "
         "the end"))
     add("--epochs", type=int, metavar="N", help=(
-        f"default: {Config.epochs}, short {SHORT['epochs']}"))
+        f"default: {Config.epochs}; with --short {SHORT['epochs']}"))
     add("--batch", type=int, metavar="N", help=(
-        f"pairs in a batch (default: {Config.batch}, short {SHORT['batch']})"))
+        f"pairs in a batch (default: {Config.batch}; with --short {SHORT['batch']})"))
     add("--lr", type=float, metavar="X", help=(
-        f"highest learning rate (default: {Config.lr}, short {SHORT['lr']})"))
+        "initial (with --short, peak) learning rate "
+        f"(default: {Config.lr}; with --short {SHORT['lr']})"))
     add("--seed", type=int, metavar="N", help=(
         "random seed for initialisation, pair order and augmentation (default: 0)"))
     add("--device", help="cpu, cuda or mps (default: cpu)")
@@ -1505,25 +1594,32 @@ def train_options(command):
 
 
 def eval_options(command):
-    """The options of `eval`."""
-    data_options(command, "folder in KITTI odometry layout, or of scans")
+    """Add the options of `eval`."""
+    data_options(command, "folder in KITTI odometry layout, or folder of scans",
+                 "all; without --data, the test and validation splits")
     add = command.add_argument_group("network").add_argument
     add("--weights", metavar="FILE|RUN", help=(
-        "weights, or the folder of a training run (default: those shipped)"))
+        "weights, or the folder of a training run (default: the pretrained weights)"))
     add("--refine", type=int, metavar="N", help=(
         "not in the paper: average both directions, then align the scans and predict the residual "
         "motion, N times (default: 0)"))
     add("--device", help="cpu, cuda or mps (default: cpu)")
     add = command.add_argument_group("results").add_argument
-    add("--out", metavar="DIR", help="folder for NN.txt and results.json (default: results/TIME)")
+    add("--out", metavar="DIR", help=(
+        "folder for NN.txt and results.json; replaces the results of an earlier evaluation there "
+        "(default: results/TIME)"))
     add("--plot", action="store_true", help=(
         "draw the paths and the errors by length; needs matplotlib"))
 
 
 def config_from(args):
-    """The Config that the options of `train` describe. They are taken out of args."""
+    """The Config that the options of `train` describe. Removes these options from args.
+
+    The default is the short recipe for the simulated city, and the paper's settings for other data.
+    """
     if "weights" in args and args.keys() & {"neighbors", "plane"}:
-        raise ValueError("--weights brings its network along; leave out --neighbors and --no-plane")
+        raise ValueError("--weights fixes the network and its input; do not combine it with "
+                         "--neighbors or --no-plane")
     recipe = SHORT if args.pop("short", not args.get("data")) else {}
     given = {name: args.pop(name) for name in ("epochs", "batch", "lr", "plane") if name in args}
     sa1 = Config.sa1._replace(n_n=args.pop("neighbors", Config.sa1.n_n))
@@ -1531,7 +1627,7 @@ def config_from(args):
 
 
 def main(argv=None):
-    """The command line -> exit code: 0, 2 for bad input, 130 when interrupted."""
+    """Run the command line. Returns the exit code: 0, 2 for bad input, 130 when interrupted."""
     args = command_line(argv)
     kitti.keep_freed_memory()
     kitti.terminate_as_interrupted()
@@ -1540,7 +1636,7 @@ def main(argv=None):
             evaluate(**args)
         elif "resume" in args and args.keys() - {"resume", "out", "device"}:
             raise ValueError("--resume continues with the options the run was started with; give "
-                             "only --out RUN, and --device")
+                             "only --out RUN and, if needed, --device")
         else:
             train(config_from(args), **args)
     except KeyboardInterrupt as interrupt:
@@ -1548,9 +1644,9 @@ def main(argv=None):
         print(f"\nd3dlo: interrupted; {advice}", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        sys.stdout = open(os.devnull, "w")  # nobody reads it any more; Python would complain
-        print("d3dlo: standard output was closed; a training run has left a checkpoint and "
-              "continues by train --out RUN --resume", file=sys.stderr)
+        sys.stdout = open(os.devnull, "w")  # otherwise Python complains at exit
+        print("d3dlo: standard output was closed; if you were training, continue with "
+              "`python d3dlo.py train --out RUN --resume`", file=sys.stderr)
         return 2
     except (ValueError, OSError) as error:
         print(f"d3dlo: {error}", file=sys.stderr)

@@ -142,7 +142,7 @@ def training_steps(net, geometry, motions, batches, frozen=False):
     times, last = [], time.perf_counter()
     for i, (batch, T) in enumerate(d3dlo.batches(geometry, motions, CONFIG, (0,), 0, batches)):
         if i < STEPS:
-            run.advance(batch, T)
+            run.train_step(batch, T)
             times.append((time.perf_counter() - last) / len(T))
             last = time.perf_counter()
     return np.median(times[WARM_UP:])

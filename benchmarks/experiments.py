@@ -292,7 +292,7 @@ def plan(experiments, pairs, budget, seeds, out, data):
         variant = EXPERIMENTS[experiment][name]
         config = config_of(variant.changes, pairs, budget)
         depends = (config.as_dict(), variant.network.__name__, repr(variant.objective()), seed,
-                   d3dlo.GEOMETRY, data)
+                   d3dlo.GEOMETRY_VERSION, data)
         key = hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()[:12]
         return Run(experiment, name, config, seed, out / key)
 
@@ -317,7 +317,7 @@ def seconds_a_step(variant, config):
     for _ in range(2):
         start = time.perf_counter()
         batch, T = d3dlo.training_batch([records], [motions], pairs, config, rng)
-        training.advance(batch, T)
+        training.train_step(batch, T)
         times.append(time.perf_counter() - start)
     return min(times) / len(T)
 
