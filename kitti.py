@@ -64,7 +64,7 @@ OTHER_FORMATS = b"\x93NUMPY", b"ply\n", b"ply\r", b"# .PCD"  # how files of othe
 
 
 def _check_scan_size(path, size):
-    """ValueError unless a .bin file of `size` bytes can hold a scan."""
+    """Raise ValueError unless a .bin file of `size` bytes can hold a scan."""
     if size == 0 or size % 16:
         raise ValueError(f"{path} has {size} bytes, but a scan has 16 (four float32) per point: "
                          f"copy or unpack it again. {FIVE_FLOATS}.")
@@ -74,9 +74,9 @@ def read_scan(path: str | Path, intensity_max: float = 1) -> np.ndarray:
     """Read one scan, a .bin or .npy file.
 
     Returns (N,4) float32: x, y, z [m] in the LiDAR's frame, and the intensity divided by
-    `intensity_max`. NaN is kept. A .bin file holds four float32 per point, as KITTI's. A .npy file
-    holds an array (N,3) or (N,4); without a fourth column the intensities are 0. Raises OSError
-    when the file cannot be read, ValueError when it is empty, damaged or of another format.
+    `intensity_max`. NaN is kept. A .bin file holds four float32 per point, like KITTI's. A .npy
+    file holds an array (N,3) or (N,4); without a fourth column the intensities are 0. Raises
+    OSError if the file cannot be read, and ValueError if it is empty, damaged or of another format.
     """
     path = Path(path)
     scan = _read_npy(path) if path.suffix == ".npy" else _read_bin(path)
@@ -102,7 +102,7 @@ def _read_npy(path):
     except OSError:
         raise
     except Exception:  # np.load raises many exception types; all of them mean a corrupt file
-        raise ValueError(f"{path} is no NumPy file or is damaged: save the scan again.") from None
+        raise ValueError(f"{path} is damaged or not a NumPy file: save the scan again.") from None
     shape = getattr(points, "shape", ())  # an archive of several arrays has no shape
     if (len(shape) != 2 or shape[0] == 0 or shape[1] not in (3, 4)
             or points.dtype.kind not in "fiu"):
@@ -118,8 +118,8 @@ def read_calib(path: str | Path) -> np.ndarray:
     """Read the row `Tr` of a sequence's calib.txt.
 
     Returns T_cam0_velo (4,4) float64, which maps points from the Velodyne frame to the frame of the
-    rectified left camera [m]. Raises FileNotFoundError, and ValueError when `Tr` is missing or is
-    not 12 finite numbers with a rotation.
+    rectified left camera [m]. Raises FileNotFoundError if there is no such file, and ValueError if
+    `Tr` is missing or is not 12 finite numbers with a rotation.
     """
     path = Path(path)
     remedy = ("KITTI's is in data_odometry_calib.zip; for drives of your own write the line "
@@ -143,7 +143,7 @@ def _calib_row(path, name, count):
 
 
 def _is_rigid(row):
-    """Whether (3,4) is finite, with a rotation in its first three columns."""
+    """Whether `row` (3,4) is finite and its first three columns are a rotation."""
     R = row[:, :3]
     with np.errstate(all="ignore"):  # huge numbers overflow
         deviation = np.abs(R @ R.T - np.eye(3)).max()
@@ -154,8 +154,8 @@ def _is_rigid(row):
 def write_tum(path: str | Path, T: np.ndarray, times: np.ndarray) -> None:
     """Write poses (n,4,4) at `times` (n,) [s] as a TUM trajectory file, through a temporary file.
 
-    A row is t x y z qx qy qz qw, with qw >= 0, in the frame of the poses. Raises ValueError when
-    the numbers of poses and times differ, and OSError.
+    A row is t x y z qx qy qz qw, with qw >= 0, in the frame of the poses. Raises ValueError if the
+    numbers of poses and times differ, and OSError if the file cannot be written.
     """
     q = Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True)  # (n,4)
     with replacing(path) as temporary, open(temporary, "w", newline="\n") as file:
@@ -225,7 +225,7 @@ def from_vector(v: np.ndarray) -> np.ndarray:
 
 
 class Sequence:
-    """A sequence of ROOT in KITTI's layout. All its files are checked when it is opened.
+    """A sequence of ROOT in KITTI's layout. Its files are checked when it is opened.
 
     The files are ROOT/sequences/NAME/velodyne/000000.bin ..., ROOT/sequences/NAME/calib.txt and,
     where there is ground truth, ROOT/poses/NAME.txt.
@@ -233,7 +233,7 @@ class Sequence:
     name, folder: its name and ROOT/sequences/NAME; scan_paths: list of n paths; Tr (4,4):
     T_cam0_velo; poses_cam (n,4,4): the poses as in the file; poses (n,4,4): T_0t in the Velodyne
     frame. Both are None without ground truth. Raises FileNotFoundError for a missing file, and
-    ValueError for a damaged one or when the numbers of scans and poses differ.
+    ValueError for a damaged one or if the numbers of scans and poses differ.
     """
 
     intensity_max = 1  # intensities are divided by this; KITTI's are within 0..1
@@ -244,12 +244,12 @@ class Sequence:
         velodyne = self.folder / "velodyne"
         self.scan_paths = sorted(velodyne.glob("*.bin"))
         if not self.scan_paths:
-            raise FileNotFoundError(f"{velodyne} holds no scans: unpack data_odometry_velodyne.zip "
-                                    "over it, other archives have none.")
+            raise FileNotFoundError(f"{velodyne} holds no scans: unpack "
+                                    "data_odometry_velodyne.zip; the other archives hold none.")
         for i, path in enumerate(self.scan_paths):
             if path.name != f"{i:06d}.bin":
                 raise ValueError(f"{velodyne} should hold {i:06d}.bin next but holds {path.name}: "
-                                 "scans are numbered from 000000 without a gap, unpack "
+                                 "scans are numbered from 000000 without a gap; unpack "
                                  "data_odometry_velodyne.zip again.")
             _check_scan_size(path, path.stat().st_size)
         self.Tr = read_calib(self.folder / "calib.txt")
@@ -260,8 +260,8 @@ class Sequence:
             self.poses_cam = read_poses(truth)  # (n,4,4)
             if len(self.poses_cam) != len(self):
                 raise ValueError(f"{truth} has {len(self.poses_cam)} poses but {velodyne} has "
-                                 f"{len(self)} scans: the two must agree, unpack whichever is "
-                                 "incomplete again.")
+                                 f"{len(self)} scans: the numbers must agree; unpack the "
+                                 "incomplete archive again.")
             self.poses = camera_to_velo(self.poses_cam, self.Tr)  # (n,4,4)
 
     def __len__(self):
@@ -275,7 +275,7 @@ class Sequence:
         """True motions T_{t,t+1} = inv(T_t) @ T_{t+1} (n-1,4,4), eq. 1 of the paper.
 
         They are in the Velodyne frame and map points of scan t+1 to the frame of scan t. Raises
-        ValueError when the sequence has no ground truth.
+        ValueError if the sequence has no ground truth.
         """
         if self.poses is None:
             raise ValueError(f"Sequence {self.name} has no ground truth: put it into ROOT/poses/"
@@ -290,7 +290,7 @@ class ScanFolder(Sequence):
     name is the folder's. There is no calibration and no ground truth: Tr, poses_cam and poses are
     None. Intensities are divided by intensity_max, 1 or 255. times (n,) are the seconds in the
     folder's times.txt, or else those of 10 scans a second. notes is a list of lines, one for each
-    assumption made. Raises ValueError when the files do not fit together or are no scans.
+    assumption made. Raises ValueError if the files do not fit together or are not scans.
     """
 
     def __init__(self, folder):
@@ -332,7 +332,7 @@ def scans_in(folder):
 def _largest_intensity(paths):
     """The largest intensity in ten scans spread over a folder.
 
-    ValueError for one below 0 or above 255, which cannot be an intensity.
+    Raises ValueError for a value below 0 or above 255, which cannot be an intensity.
     """
     largest = 0
     for i in np.unique(np.linspace(0, len(paths) - 1, 10).astype(int)):
@@ -340,7 +340,7 @@ def _largest_intensity(paths):
         intensity = intensity[np.isfinite(intensity)]
         if intensity.min(initial=0) < 0:
             raise ValueError(f"{paths[i]}: the fourth value of a point is {intensity.min():.4g}, "
-                             "but no intensity is negative, so these are not x, y, z, intensity. "
+                             "but intensities are not negative, so this is not x, y, z, intensity. "
                              f"{FIVE_FLOATS}.")
         if intensity.max(initial=0) > 255:
             raise ValueError(f"{paths[i]} has intensities up to {intensity.max():.4g}, but they "
@@ -350,7 +350,8 @@ def _largest_intensity(paths):
 
 
 def _read_times(path, n):
-    """The times (n,) [s] in a times.txt, one per line. ValueError unless they increase."""
+    """Read the times (n,) [s] in a times.txt, one per line. Raises ValueError unless they increase.
+    """
     try:
         times = np.array(path.read_bytes().split(), dtype=float)
     except ValueError:
@@ -375,8 +376,8 @@ def _is_raw_data(root):
 def sequence_names(root: str | Path) -> list[str]:
     """The names of the sequences of ROOT that have scans, sorted.
 
-    A plain folder of scans is one sequence with the folder's name. Raises FileNotFoundError when
-    there are no scans, or none in a known layout.
+    A plain folder of scans is one sequence with the folder's name. Raises FileNotFoundError if
+    there are no scans in a known layout.
     """
     root = Path(root)
     if _is_plain_folder(root) and scans_in(root):
@@ -388,7 +389,7 @@ def sequence_names(root: str | Path) -> list[str]:
         if _is_raw_data(root):
             remedy = "convert KITTI's raw data with `python kitti.py raw DRIVE ROOT`"
         raise FileNotFoundError(
-            f"{root} has no scans in a known layout: {remedy}. Known are a folder of *.bin or "
+            f"{root} has no scans in a known layout: {remedy}. Known layouts: a folder of *.bin or "
             "*.npy files, and KITTI's odometry layout, ROOT/sequences/00/{velodyne/000000.bin, "
             "calib.txt} and ROOT/poses/00.txt.")
     return names
@@ -397,17 +398,17 @@ def sequence_names(root: str | Path) -> list[str]:
 def open_sequences(root: str | Path, names: str | list[str] | None = None) -> list[Sequence]:
     """Open sequences of ROOT, in the order given, each once.
 
-    names: one or several of the folders under ROOT/sequences, the splits of SPLITS (those of their
-    sequences that ROOT has), or "all"; None means "all". A ROOT without a folder sequences/ is one
-    `ScanFolder`. Raises ValueError for a name that ROOT does not have or a split of which it has
-    nothing, and the errors of `sequence_names`, `Sequence` and `ScanFolder`.
+    names: one or several names of folders under ROOT/sequences, splits of SPLITS, or "all"; None
+    means "all". Of a split, the sequences that ROOT has are opened. A ROOT without a folder
+    sequences/ is one `ScanFolder`. Raises ValueError for a name or split of which ROOT has nothing,
+    and the errors of `sequence_names`, `Sequence` and `ScanFolder`.
     """
-    there = sequence_names(root)
+    available = sequence_names(root)
     choices = {}
     for split, members in SPLITS.items():
-        choices[split] = [name for name in members if name in there]
-    choices["all"] = there
-    for name in there:
+        choices[split] = [name for name in members if name in available]
+    choices["all"] = available
+    for name in available:
         choices[name] = [name]
 
     if names is None:
@@ -436,12 +437,12 @@ STATS = ("usable points", "mean intensity", "median range of the centroids [m]",
 
 
 def usable_points(scan, max_range=None, plane=True):
-    """The points of a scan that the network is given, and the number of broken points.
+    """Select the points of a scan that the network uses, and count the invalid ones.
 
-    (N,4) -> (M,4) float32, in the same order. Broken points are dropped first: those that are not
-    finite, or of a range or intensity that no LiDAR returns. Then points beyond `max_range` metres
-    are dropped (None: keep all) and, unless `plane`, the ground. Raises ValueError for another
-    shape than (N,4).
+    (N,4) -> (M,4) float32, in the same order, and a number. Invalid points are dropped first: those
+    that are not finite, or whose range or intensity is too large for a LiDAR. Then points beyond
+    `max_range` metres are dropped (None: keep all) and, unless `plane`, the ground plane. Raises
+    ValueError for a shape other than (N,4).
     """
     with np.errstate(over="ignore", invalid="ignore"):
         scan = np.asarray(scan, np.float32)
@@ -473,10 +474,10 @@ def scan_stats(scan, centroids):
 
 
 def domain_shift(stats, seen):
-    """Which statistics of a scan lie outside the range seen in training, by a factor of 1.5.
+    """Name the statistics of a scan that differ from those in training by a factor above 1.5.
 
-    stats: STATS (4,); seen (2,4): their least and largest values in training. Returns a text that
-    names them, empty if there are none.
+    stats: STATS (4,); seen (2,4): the smallest and largest values in training. Returns a text,
+    empty if there are none.
     """
     shifts = []
     for name, x, low, high in zip(STATS, stats, *seen):
@@ -491,52 +492,61 @@ def remove_plane(scan: np.ndarray, threshold=0.15, max_tilt=15.0, hypotheses=400
 
     (N,3) or more columns -> the points that are `threshold` metres or more away from the dominant
     plane whose normal is within `max_tilt` degrees of vertical. `hypotheses` planes through three
-    random points are scored on `subsample` random points; the best is fitted twice to all its
-    inliers. Order and non-finite points are kept. The scan is unchanged when no plane qualifies.
+    random points are scored on `subsample` random points. The best is fitted twice to all its
+    inliers. Order and non-finite points are kept. The scan is unchanged if no plane qualifies.
     """
-    rng = np.random.default_rng(seed)
     xyz = np.ascontiguousarray(scan[:, :3], dtype=np.float32)  # (N,3)
     finite = np.flatnonzero(np.isfinite(xyz).all(axis=1))
     if len(finite) < 3:
         return scan
-    min_cosine = np.cos(np.radians(max_tilt))
+    rng, min_cosine = np.random.default_rng(seed), np.cos(np.radians(max_tilt))
+    # Hypotheses: planes through three random points, scored on a random sample
+    triples = xyz[finite[rng.integers(len(finite), size=(3, hypotheses))]]  # (3,H,3)
+    sample = xyz[finite[rng.integers(len(finite), size=min(subsample, len(finite)))]]  # (M,3)
+    plane = _best_plane(triples, sample, threshold, min_cosine)
+    for _ in range(2):  # refine the best one by least squares
+        if plane is not None:
+            plane = _fit_plane(xyz[_plane_inliers(xyz, *plane, threshold)])
+    if plane is None or abs(plane[0][2]) < min_cosine:  # too steep: a wall, for example
+        return scan
+    return scan[~_plane_inliers(xyz, *plane, threshold)]
 
-    # Hypotheses: planes normal . x = offset through three random points a, b, c
-    triples = finite[rng.integers(len(finite), size=(3, hypotheses))]
-    a, b, c = xyz[triples].astype(float)  # (H,3) each
+
+def _best_plane(triples, sample, threshold, min_cosine):
+    """The plane n . x = d with the most inliers: (n (3,), d), or None if none is near level.
+
+    triples (3,H,3): three points for each of H planes; sample (M,3): the points to score them on.
+    """
+    a, b, c = triples.astype(float)  # (H,3) each
     normal = np.cross(b - a, c - a)  # (H,3)
     length = np.linalg.norm(normal, axis=1)
     upright = np.abs(normal[:, 2]) > min_cosine * np.maximum(length, 1e-9)
     if not upright.any():
-        return scan
+        return None
     normal = normal[upright] / length[upright, None]
     offset = (normal * a[upright]).sum(axis=1)  # (H,)
-
-    # Score them by the number of inliers among M random points
-    sample = xyz[finite[rng.integers(len(finite), size=min(subsample, len(finite)))]]  # (M,3)
     projected = normal.astype(np.float32) @ sample.T  # (H,M)
     distance = np.abs(projected - offset[:, None].astype(np.float32))  # (H,M)
     best = (distance < threshold).sum(axis=1).argmax()
-    n, d = normal[best], offset[best]
+    return normal[best], offset[best]
 
-    def inliers(n, d):  # (N,) bool
-        with np.errstate(invalid="ignore", over="ignore"):  # NaN is never an inlier
-            return np.abs(xyz @ n.astype(np.float32) - np.float32(d)) < threshold
 
-    # Least squares: the normal is the direction in which the inliers vary least
-    for _ in range(2):
-        points = xyz[inliers(n, d)]
-        if len(points) < 3:
-            return scan
-        mean = points.mean(axis=0, dtype=float)
-        centred = points - mean.astype(np.float32)
-        covariance = (centred.T @ centred).astype(float)  # (3,3), but for a factor
-        _, directions = np.linalg.eigh(covariance)  # by increasing variance
-        n = directions[:, 0]
-        d = n @ mean
-    if abs(n[2]) < min_cosine:  # a wall, for example
-        return scan
-    return scan[~inliers(n, d)]
+def _fit_plane(points):
+    """The least-squares plane n . x = d of points (m,3): (n (3,), d), or None for fewer than 3."""
+    if len(points) < 3:
+        return None
+    mean = points.mean(axis=0, dtype=float)
+    centred = points - mean.astype(np.float32)
+    covariance = (centred.T @ centred).astype(float)  # (3,3), times m
+    _, directions = np.linalg.eigh(covariance)  # by increasing variance
+    n = directions[:, 0]  # the direction in which the points vary least
+    return n, n @ mean
+
+
+def _plane_inliers(xyz, n, d, threshold):
+    """Which points (N,3) are within `threshold` of the plane n . x = d: (N,) bool."""
+    with np.errstate(invalid="ignore", over="ignore"):  # NaN is never an inlier
+        return np.abs(xyz @ n.astype(np.float32) - np.float32(d)) < threshold
 
 
 # ------------------------------------------------------------------------------------------------
@@ -546,8 +556,8 @@ def remove_plane(scan: np.ndarray, threshold=0.15, max_tilt=15.0, hypotheses=400
 def progress(items, total, what):
     """Yield the items and report on stderr: how many of `total` are done, the rate, the time left.
 
-    On a terminal the line is rewritten in place. Elsewhere a line is printed every 10 s, or after
-    every tenth of the time so far when that is longer.
+    On a terminal the line is rewritten in place. Elsewhere a line is printed every 10 s or, if that
+    is longer, after another tenth of the elapsed time.
     """
     tty = sys.stderr.isatty()
     began, done = time.monotonic(), 0
@@ -587,7 +597,7 @@ def in_processes(function, tasks, workers=None, chunksize=4):
     """Yield function(task) for every task, in order, computed by a pool of worker processes.
 
     workers: number of processes, None for one per core; chunksize: tasks sent to a worker at once.
-    Raises OSError when a worker died.
+    Raises OSError if a worker dies.
     """
     pool = ProcessPoolExecutor(workers or cores(), initializer=_leave_signals_to_parent)
     try:
@@ -601,22 +611,22 @@ def in_processes(function, tasks, workers=None, chunksize=4):
 
 
 def _leave_signals_to_parent():
-    """Let a worker ignore Ctrl-C, which the parent handles, and end at SIGTERM."""
+    """Make a worker ignore Ctrl-C, which the parent handles, and end at SIGTERM."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def terminate_as_interrupted():
     """Treat SIGTERM like Ctrl-C from now on, so that every `finally` runs."""
-    if threading.current_thread() is threading.main_thread():  # Python's rule for signals
+    if threading.current_thread() is threading.main_thread():  # only it may set handlers
         signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def keep_freed_memory():
     """Let glibc keep large freed blocks instead of returning them to the system.
 
-    Otherwise every allocation faults its pages in again, a third of the time of a training step on
-    a CPU.
+    Otherwise every allocation causes new page faults, which cost a third of a training step's time
+    on a CPU.
     """
     try:
         libc = ctypes.CDLL(None)
@@ -648,11 +658,11 @@ def new_name(parent):
 
 @contextmanager
 def run_folder(path):
-    """Make a folder and hold it for one writer. If it is new and still empty at the end, remove it.
+    """Make a folder and lock it for one writer. If it is new and still empty at the end, remove it.
 
-    The holder locks the file PATH/lock, which nothing else opens. The system unlocks it when the
-    process ends or is killed. Without fcntl, as on Windows, nothing is locked. Raises
-    ValueError while another process holds the folder.
+    The lock is on the file PATH/lock, which nothing else opens. The system releases it when the
+    process ends or is killed. Without fcntl, as on Windows, nothing is locked. Raises ValueError if
+    another process has locked the folder.
     """
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     path.mkdir(parents=True, exist_ok=True)
@@ -663,8 +673,8 @@ def run_folder(path):
             except BlockingIOError:
                 lock.seek(0)
                 holder = lock.read().strip() or "just started"
-                raise ValueError(f"{path}: another training run writes to it, {holder}; wait for "
-                                 "its end, or choose another folder") from None
+                raise ValueError(f"{path}: in use by another training run ({holder}); wait until "
+                                 "it has ended, or choose another folder") from None
         lock.truncate(0)
         lock.write(f"process {os.getpid()} on {platform.node()}\n")
         lock.flush()
@@ -680,10 +690,10 @@ def run_folder(path):
 
 @contextmanager
 def delayed_interrupt():
-    """Delay Ctrl-C and SIGTERM: yield a list to which a signal is added instead of interrupting.
+    """Delay Ctrl-C and SIGTERM. Yields a list to which the first signal is added.
 
-    A second signal interrupts at once. Outside the main thread, where Python does not let us handle
-    signals, nothing is delayed.
+    A second signal interrupts at once. Outside the main thread, where Python allows no signal
+    handlers, nothing is delayed.
     """
     received, handlers = [], {}
 
@@ -707,17 +717,17 @@ def delayed_interrupt():
 
 
 def cached_records(sequences, compute, dtype, settings, cache="cache"):
-    """Compute a record for every scan, once: later calls read the records from files.
+    """Compute a record for every scan and store it. Later calls read the stored records.
 
     sequences: a list of `Sequence`; compute: a function from a scan (N,4) to a record of `dtype`,
-    which can be pickled; settings: everything else that the records depend on. Returns two lists
-    with an entry for each sequence: records (n,), memory-mapped, and the CRC-32 of every scan (n,)
-    uint32, from which `fingerprint` identifies the data.
+    which can be pickled; settings: everything else that the records depend on; cache: the folder of
+    the files. Returns two lists with an entry for each sequence: records (n,), memory-mapped, and
+    the CRC-32 of every scan (n,) uint32, from which `fingerprint` identifies the data.
 
-    A file's name is a hash of the settings and of the path, size and times of every scan, so a
-    stale file is never read. A damaged file is made again. Files are moved into place when they are
-    complete, so two processes may share a cache. All cores share the work. Raises ValueError,
-    naming the file, for a scan that `compute` refuses.
+    A file's name is a hash of the settings and of the folder and every scan's size and times, so a
+    stale file is never read. A damaged file is computed again. Files are moved into place when they
+    are complete, so two processes may share a cache. The work is spread over all cores. Raises
+    ValueError, naming the file, for a scan that `compute` refuses.
     """
     row_dtype = np.dtype([("record", dtype), ("scan_crc", "u4"), ("crc", "u4")])
     files = [Path(cache) / f"{s.name}-{_cache_key(s, settings, dtype)}.npy" for s in sequences]
@@ -760,7 +770,7 @@ def _cache_key(sequence, settings, dtype):
 
 
 def _cache_row(task, compute, row_dtype):
-    """(path of a scan, intensity_max) -> the bytes of its row in a cache file."""
+    """Task (path of a scan, intensity_max) -> the bytes of its row in a cache file."""
     path, intensity_max = task
     scan = read_scan(path, intensity_max)
     row = np.zeros((), row_dtype)
@@ -776,7 +786,7 @@ def _cache_row(task, compute, row_dtype):
 def _is_intact(file, row_dtype, n):
     """Whether a cache file exists, holds n rows and has the right checksums.
 
-    Says so on stderr when the file is damaged.
+    Reports a damaged file on stderr.
     """
     if not file.is_file():
         return False
@@ -788,7 +798,7 @@ def _is_intact(file, row_dtype, n):
                 return True
     except Exception:  # np.load raises many exception types; all of them mean a corrupt file
         pass
-    print(f"{file}: damaged, so it is made again", file=sys.stderr)
+    print(f"{file}: damaged, so it is computed again", file=sys.stderr)
     return False
 
 
@@ -821,22 +831,22 @@ def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int
     in its parent folder. Writes the folder ROOT/sequences/2011_09_26_drive_0013 and the ground
     truth ROOT/poses/2011_09_26_drive_0013.txt, in the rectified left camera's frame. Scans are hard
     links where the file system allows it, else copies. A drive in which scans are missing is split
-    at the gaps, into sequences with -1, -2 ... behind their names. Returns {name of a sequence:
+    at the gaps, into sequences whose names end with -1, -2 ... Returns {name of a sequence:
     (number of its first scan in the drive, of its last)}.
 
-    A pose is that of the time in velodyne_points/timestamps.txt: the middle of the scanner's turn,
-    when it faces forward and triggers the cameras. The "sync" data is aligned to this time. The
-    GPS/IMU packet of a scan was recorded at another time, 12 to 25 ms later in drive 0013. So the
-    nearest packet is moved by its own velocity and turn rate to the time of the scan. The points
-    are used as they are: those of a turn were measured over 0.1 s.
+    A pose is for the time in velodyne_points/timestamps.txt: the middle of the scanner's turn, when
+    it faces forward and triggers the cameras. The "sync" data is aligned to this time. The GPS/IMU
+    packet of a scan was recorded at another time, 12 to 25 ms later in drive 0013. So the pose of
+    the nearest packet is moved to the time of the scan by the packet's velocity and turn rate. The
+    points are not corrected for the motion during the 0.1 s of a turn.
 
     Raises FileNotFoundError for a missing file, naming its archive, and ValueError for a damaged
-    one or when ROOT holds such a sequence already. ROOT is then unchanged.
+    one or if ROOT holds such a sequence already. ROOT is then unchanged.
     """
     drive, root = Path(drive), Path(root)
     match = re.fullmatch(r"((\d{4}_\d\d_\d\d)_drive_\d+)_sync", drive.resolve().name)
     if not match:
-        raise ValueError(f"{drive} is no drive of KITTI's raw data: give a folder such as "
+        raise ValueError(f"{drive} is not a drive of KITTI's raw data: give a folder such as "
                          "2011_09_26/2011_09_26_drive_0013_sync, of the synced+rectified data.")
     name, date = match.groups()
     archive = f"{name}_sync.zip"
@@ -853,21 +863,34 @@ def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int
     if not len(has_pose):
         raise ValueError(f"{drive}: no scan was taken within 0.1 s of a GPS/IMU packet; "
                          f"unpack {archive} again.")
-
-    # Split the scans at the gaps; each run of consecutive scans becomes a sequence
-    gaps = np.flatnonzero(np.diff(numbers[has_pose]) != 1) + 1
-    runs = np.split(has_pose, gaps)
-    names = [name] if len(runs) == 1 else [f"{name}-{i + 1}" for i in range(len(runs))]
-    parts = dict(zip(names, runs))
-
+    parts = _split_at_gaps(name, numbers, has_pose)
     packets = np.stack([_read_packet(path) for path in packets])  # (m,30)
     T_imu = _imu_poses(packets, nearest, delay / SECOND)  # (n,4,4)
+    _write_raw_sequences(root, parts, scans, times, T_imu, Tr, T_velo_imu)
+    return {part: (int(numbers[run[0]]), int(numbers[run[-1]])) for part, run in parts.items()}
 
+
+def _split_at_gaps(name, numbers, chosen):
+    """Split the chosen scans where their numbers have a gap -> {name of a sequence: its scans}.
+
+    numbers (n,): the number of each scan in the drive; chosen: indices of scans.
+    """
+    gaps = np.flatnonzero(np.diff(numbers[chosen]) != 1) + 1
+    runs = np.split(chosen, gaps)  # runs of consecutive scans
+    names = [name] if len(runs) == 1 else [f"{name}-{i + 1}" for i in range(len(runs))]
+    return dict(zip(names, runs))
+
+
+def _write_raw_sequences(root, parts, scans, times, T_imu, Tr, T_velo_imu):
+    """Write all sequences of a drive and their ground truth, or raise an error and write none.
+
+    parts: {name: indices of its scans}; scans: paths; times (n,) and T_imu (n,4,4): of all scans.
+    """
     folders = {part: root / "sequences" / part for part in parts}
     truths = {part: root / "poses" / f"{part}.txt" for part in parts}
     for path in (*folders.values(), *truths.values()):
         if path.exists():
-            raise ValueError(f"{path} is there already: remove it or choose another ROOT.")
+            raise ValueError(f"{path} already exists: remove it or choose another ROOT.")
     temporary = {part: temporary_beside(folder) for part, folder in folders.items()}
     try:
         for part, run in parts.items():
@@ -880,7 +903,6 @@ def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int
     finally:
         for folder in temporary.values():
             shutil.rmtree(folder, ignore_errors=True)
-    return {part: (int(numbers[run[0]]), int(numbers[run[-1]])) for part, run in parts.items()}
 
 
 def _write_raw_sequence(folder, scans, Tr, times):
@@ -900,16 +922,16 @@ def _write_raw_sequence(folder, scans, Tr, times):
 
 
 def _require_file(path, archive):
-    """FileNotFoundError, naming the archive it is in, when one of KITTI's files is missing."""
+    """Raise FileNotFoundError, naming its archive, if one of KITTI's files is missing."""
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: it is in {archive}.")
 
 
 def _raw_stream(folder, suffix, archive):
-    """The files of a stream that have a time: numbers (n,), paths (list), times (n,).
+    """List the files of a stream that have a time: numbers (n,), paths (list), times (n,).
 
-    Line i of timestamps.txt, from 0, is the time of file i, to the nanosecond. It is blank where
-    the recording has lost a file, as in drive 2011_09_26_drive_0009.
+    Line i of timestamps.txt, counted from 0, is the time of file i, to the nanosecond. It is blank
+    where the recording has lost a file, as in drive 2011_09_26_drive_0009.
     """
     stamps = folder / "timestamps.txt"
     paths = sorted(path for path in folder.glob(f"data/*{suffix}") if path.stem.isdecimal())
@@ -929,7 +951,7 @@ def _raw_stream(folder, suffix, archive):
 
 
 def _read_packet(path):
-    """A GPS/IMU packet: (30,) numbers in the order of oxts/dataformat.txt."""
+    """Read a GPS/IMU packet: (30,) numbers in the order of oxts/dataformat.txt."""
     try:
         packet = np.array(path.read_bytes().split(), dtype=float).reshape(30)
     except ValueError:
@@ -941,7 +963,7 @@ def _read_packet(path):
 
 
 def _raw_calib(folder, archive):
-    """The calib_*.txt of a date -> Tr (4,4), from Velodyne to rectified camera, and T_velo_imu."""
+    """Read the calib_*.txt of a date: Tr (4,4), Velodyne to rectified camera, and T_velo_imu."""
     def transform(name, rotation, translation=None):
         path = folder / name
         _require_file(path, archive)
@@ -967,8 +989,8 @@ def _imu_poses(packets, nearest, delay):
 
     The pose of a packet is that of the devkit's convertOxtsToPose.m: a Mercator projection with
     the scale of the drive's first latitude, and roll, pitch, yaw about x, y, z in that order.
-    From there, velocity and turn rate are constant: the unit moves along an arc, and the chord of
-    the arc has the direction of the velocity half-way.
+    From there to the scan, velocity and turn rate are taken as constant. The unit then moves along
+    an arc, whose chord has the direction of the velocity half-way.
     """
     scale = EARTH_RADIUS * np.cos(np.radians(packets[0, 0]))
     packets, delay = packets[nearest], delay[:, None]  # (n,30), (n,1)

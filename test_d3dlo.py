@@ -2312,7 +2312,7 @@ def test_a_raw_drive_is_converted_with_poses_at_the_times_of_its_scans(cwd, caps
     for scan, path in zip(sorted((cwd / DRIVE).rglob("*.bin")), s.scan_paths, strict=True):
         assert path.samefile(scan)  # a link, not a copy
     before = files_of(cwd)
-    fails_with_one_line(kitti.main, ["raw", DRIVE, "root"], "drive_0013 is there already", capsys)
+    fails_with_one_line(kitti.main, ["raw", DRIVE, "root"], "drive_0013 already exists", capsys)
     assert files_of(cwd) == before
 
 
@@ -2411,7 +2411,7 @@ def test_an_incomplete_or_damaged_raw_drive_fails_with_one_line(cwd, capsys, spo
 
 def test_a_folder_that_is_not_a_raw_drive_fails_with_one_line(cwd, capsys):
     for name in ("gone", ".", "2011_09_26_drive_0013_extract"):
-        words = f"{name} is no drive of KITTI's raw data"
+        words = f"{name} is not a drive of KITTI's raw data"
         fails_with_one_line(kitti.main, ["raw", name, "root"], words, capsys)
     assert not any(cwd.iterdir())
 
