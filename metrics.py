@@ -1,4 +1,4 @@
-"""How good is a trajectory? KITTI's segment errors, errors per step, ATE and RPE. NumPy only.
+"""Errors of a trajectory: KITTI's segment errors, errors per step, ATE and RPE. NumPy only.
 
 A trajectory is an array (n,4,4) of poses: T_0i maps points from frame i to frame 0, in metres. In
 KITTI's pose files, frame i is the rectified left camera at scan i. The segment errors are those of
@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 
 LENGTHS = np.arange(100, 801, 100)  # length of a segment [m]; devkit: lengths[]
-START_EVERY = 10  # frames from the start of a segment to the next; devkit: step_size, one second
+START_EVERY = 10  # frames between the starts of two segments, one second; devkit: step_size
 SEGMENT = np.dtype([
     ("first", int),  # frame in which the segment starts
     ("last", int),  # frame in which it ends
@@ -42,9 +42,9 @@ All in the frame of the files; KITTI's is the rectified left camera."""
 
 
 def temporary_beside(path):
-    """A path beside `path` for this process to write to. Delete leftovers of dead local processes.
+    """A temporary path beside `path`, named after this machine and process.
 
-    The name ends with the name of the machine and the id of the process.
+    Deletes leftovers of dead local processes.
     """
     prefix = f".{path.name}.{platform.node()}."
     if os.name == "posix":  # on Windows, os.kill(process, 0) would send Ctrl-C
@@ -71,7 +71,7 @@ def _is_dead(process):
 
 @contextmanager
 def naming(path):
-    """Name the file in an OSError of the block that does not, for example when the disk is full."""
+    """Add the file's name to an OSError of the block that lacks it, such as for a full disk."""
     try:
         yield
     except OSError as error:
@@ -84,8 +84,8 @@ def naming(path):
 def replacing(path):
     """Yield a temporary path beside `path`, and move it to `path` if the block succeeds.
 
-    So `path` never holds a half-written file. Raises OSError, naming the file, when writing fails
-    or when `path` is not a regular file.
+    So `path` never holds a half-written file. Raises OSError, naming the file, if writing fails or
+    if `path` is not a regular file.
     """
     path = Path(path)
     if path.exists() and not path.is_file():
@@ -116,8 +116,8 @@ def read_poses(path: str | Path) -> np.ndarray:
     """Read a KITTI pose file.
 
     A line holds 12 numbers, the top three rows of a pose; blank lines are skipped. Returns (n,4,4)
-    float64, translations in metres. Raises FileNotFoundError, and ValueError when the file holds no
-    pose, or a line that is not 12 finite numbers or not a rigid motion.
+    float64, translations in metres. Raises FileNotFoundError if there is no such file, and
+    ValueError if it holds no pose, or a line that is not 12 finite numbers or not a rigid motion.
     """
     text = Path(path).read_bytes().removeprefix(codecs.BOM_UTF8)
     if text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -148,7 +148,7 @@ def read_poses(path: str | Path) -> np.ndarray:
 
 
 def write_poses(path: str | Path, T: np.ndarray) -> None:
-    """Write poses (n,4,4) as a KITTI pose file, through a temporary file. Raises OSError."""
+    """Write poses (n,4,4) as a KITTI pose file. Raises OSError if it cannot be written."""
     rows = np.asarray(T)[:, :3].reshape(-1, 12)
     with replacing(path) as temporary, open(temporary, "w", newline="\n") as file:
         np.savetxt(file, rows, fmt="%.9e")
@@ -159,7 +159,7 @@ def write_poses(path: str | Path, T: np.ndarray) -> None:
 
 
 def _check_shapes(T_gt, T_est):
-    """Both trajectories as float64 arrays. ValueError when their shapes differ."""
+    """Return both trajectories as float64 arrays. Raises ValueError if their shapes differ."""
     T_gt, T_est = np.asarray(T_gt, float), np.asarray(T_est, float)
     if T_gt.shape != T_est.shape:
         raise ValueError(f"true poses {T_gt.shape}, but estimated poses {T_est.shape}; both must "
@@ -177,13 +177,13 @@ def segment_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
     """Errors of all KITTI segments of a sequence: eqs. 6 to 8, devkit: calcSequenceErrors.
 
     True and estimated poses (n,4,4), both in the same frame -> structured array (segments,) with
-    fields first and last (frames), length [m], t_err [%], r_err [deg/m]. `kitti_errors` takes the
-    means of eqs. 7 and 8.
+    fields first and last (frames), length [m], t_err [%], r_err [deg/m]. `kitti_errors` computes
+    the means in eqs. 7 and 8.
 
     A segment starts at every 10th frame. It ends at the first frame whose true path from there is
     longer than 100, 200, ... 800 m. Errors are divided by this nominal length, as in the devkit,
     and not by the straight distance of eqs. 7 and 8. The devkit sums the path in float32, which can
-    shift `last` by one frame; here it is float64. Raises ValueError when the shapes differ.
+    shift `last` by one frame; here it is float64. Raises ValueError if the shapes differ.
     """
     T_gt, T_est = _check_shapes(T_gt, T_est)
     path = path_lengths(T_gt)  # (n,)
@@ -193,7 +193,7 @@ def segment_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
     first = np.repeat(starts, len(LENGTHS))  # (starts*lengths,)
     length = np.tile(LENGTHS, len(starts))  # (starts*lengths,)
 
-    # The first frame beyond that length; drop segments that the drive is too short for
+    # The first frame beyond that length; drop segments that go beyond the end of the drive
     last = np.searchsorted(path, path[first] + length, side="right")
     complete = last < len(path)
     first, last, length = first[complete], last[complete], length[complete]  # (segments,)
@@ -228,8 +228,7 @@ def step_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
     """Error of every step from a frame to the next: evo's relative pose error with delta 1.
 
     True and estimated poses (n,4,4) -> (n-1,2): length [m] and angle [deg] of
-    inv(motion_est) @ motion_gt, in the frame of the poses. Raises ValueError when the shapes
-    differ.
+    inv(motion_est) @ motion_gt, in the frame of the poses. Raises ValueError if the shapes differ.
     """
     T_gt, T_est = _check_shapes(T_gt, T_est)
     motion_gt = np.linalg.inv(T_gt[:-1]) @ T_gt[1:]  # (n-1,4,4)
@@ -249,14 +248,14 @@ def step_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
 def absolute_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
     """Distances between true and estimated positions, without any alignment.
 
-    True and estimated poses (n,4,4) -> (n,) [m]. Raises ValueError when the shapes differ.
+    True and estimated poses (n,4,4) -> (n,) [m]. Raises ValueError if the shapes differ.
     """
     T_gt, T_est = _check_shapes(T_gt, T_est)
     return np.linalg.norm(T_gt[:, :3, 3] - T_est[:, :3, 3], axis=1)
 
 
 def rmse(errors):
-    """Root mean square of errors (n,), evo's rmse. NaN when there are none."""
+    """Root mean square of errors (n,), evo's rmse. NaN if there are none."""
     return float(np.sqrt(np.mean(np.square(errors)))) if len(errors) else float("nan")
 
 
@@ -265,7 +264,7 @@ def rmse(errors):
 
 
 def table(header, rows):
-    """A header and rows as lines of text. NaN is printed as "-".
+    """Format a header and rows as lines of text. NaN becomes "-".
 
     The first column is aligned to the left, all others to the right.
     """
@@ -283,7 +282,7 @@ def table(header, rows):
 
 
 def summary(segments, steps):
-    """Means over all sequences, as a dict. NaN where there is nothing to average.
+    """Mean errors over all sequences, as a dict. NaN where there is nothing to average.
 
     segments, steps: lists of `segment_errors` and of `step_errors`, one for each sequence.
     """
@@ -295,7 +294,7 @@ def summary(segments, steps):
 
 
 def by_length(segments):
-    """List of `segment_errors` -> {"100 m": summary, ...}, for the lengths that occur."""
+    """A list of `segment_errors` -> {"100 m": summary, ...} for the lengths that occur."""
     pooled = np.concatenate([np.empty(0, SEGMENT), *segments])
     summaries = {}
     for length in LENGTHS:
@@ -306,7 +305,7 @@ def by_length(segments):
 
 
 def row(name, s):
-    """The row of a table under HEADER, from a `summary`."""
+    """Format a `summary` as a row of a table with the columns of HEADER."""
     return [name, s["segments"], f"{s['E_t']:.3f}", f"{s['E_r']:.5f}", f"{s['t_step_m']:.4f}",
             f"{s['r_step_deg']:.4f}"]
 
@@ -316,7 +315,7 @@ def row(name, s):
 
 
 def picture(width, height):
-    """An empty matplotlib figure, in inches. ValueError without matplotlib."""
+    """An empty matplotlib figure of a size in inches. Raises ValueError without matplotlib."""
     try:
         from matplotlib.figure import Figure  # unlike pyplot, it needs no display
     except ImportError:
@@ -325,15 +324,15 @@ def picture(width, height):
 
 
 def view_from_above(T: np.ndarray) -> tuple[np.ndarray, str, str]:
-    """How to draw poses (n,4,4) from above: a matrix (2,3) and the labels of the two axes.
+    """The view from above of poses (n,4,4): a matrix (2,3) and the labels of the two axes.
 
-    The matrix maps positions to metres right and forward. The frame is found from the mean step,
-    each step in its own frame: a vehicle moves along z in a camera's frame (x right, y down,
-    z forward) and along x in a LiDAR's (x forward, y left, z up). Without any motion the frame
-    is taken to be the camera's, as in KITTI's pose files.
+    The matrix maps positions to metres right and forward. The frame is inferred from the mean step:
+    a vehicle moves along z in a camera's frame (x right, y down, z forward) and along x in a
+    LiDAR's (x forward, y left, z up). Without any motion the frame is assumed to be the camera's,
+    as in KITTI's pose files.
     """
     steps = np.linalg.inv(T[:-1]) @ T[1:]  # (n-1,4,4)
-    x, y, z = steps[:, :3, 3].sum(axis=0)  # has the direction of the mean
+    x, y, z = steps[:, :3, 3].sum(axis=0)  # in the direction of the mean step
     if abs(z) >= np.hypot(x, y):
         return np.array([[1, 0, 0], [0, 0, 1]]), "camera x, right [m]", "camera z, forward [m]"
     return np.array([[0, -1, 0], [1, 0, 0]]), "LiDAR -y, right [m]", "LiDAR x, forward [m]"
@@ -344,7 +343,7 @@ def draw(path, trajectories):
 
     trajectories: {name: (T_gt or None, T_est)}, poses (n,4,4) in a camera's or a LiDAR's frame.
     Each name is a row: the path from above and, if there is any ground truth, KITTI's errors by
-    segment length. Raises ValueError without matplotlib, and OSError.
+    segment length. Raises ValueError without matplotlib, and OSError if writing fails.
     """
     any_truth = any(T_gt is not None for T_gt, _ in trajectories.values())
     columns = 3 if any_truth else 1
@@ -374,7 +373,7 @@ def _draw_paths(axis, name, T_gt, T_est):
 
 
 def _draw_errors(axis, name, error, unit, lengths):
-    """Draw one of the errors, "E_t" or "E_r", of the summaries `by_length`."""
+    """Draw an error, "E_t" or "E_r", of the summaries that `by_length` returns."""
     metres = [int(length.split()[0]) for length in lengths]
     values = [s[error] for s in lengths.values()]
     axis.plot(metres, values, "ko-")
@@ -390,7 +389,7 @@ def _draw_errors(axis, name, error, unit, lengths):
 
 
 def _pairs_of_files(gt, est):
-    """Two pose files or two folders -> {name of a sequence: (true, estimated) pose file}."""
+    """Pair two pose files, or those of two folders: {sequence: (true, estimated) pose file}."""
     if gt.is_dir() != est.is_dir():
         raise ValueError(f"{gt} and {est}: one is a folder and the other is not; give two pose "
                          "files, or two folders of NN.txt")
@@ -401,20 +400,20 @@ def _pairs_of_files(gt, est):
         if (gt / path.name).is_file():
             pairs[path.stem] = gt / path.name, path
     if not pairs:
-        raise FileNotFoundError(f"{est}: holds no NN.txt that {gt} holds as well; give two folders "
+        raise FileNotFoundError(f"{est}: holds no NN.txt that is also in {gt}; give two folders "
                                 "with pose files of the same names")
     return pairs
 
 
 def _check_picture(png, pairs):
-    """ValueError when a picture would replace one of the pose files."""
+    """Raise ValueError if the picture would replace one of the pose files."""
     inputs = [path for pair in pairs.values() for path in pair]
     if png.exists() and any(path.exists() and png.samefile(path) for path in inputs):
         raise ValueError(f"--plot {png}: is one of the pose files; choose another name")
 
 
 def _read_pair(gt, est):
-    """True and estimated poses (n,4,4) from two pose files. ValueError when the numbers differ."""
+    """Read true and estimated poses (n,4,4). Raises ValueError if their numbers differ."""
     T_gt, T_est = read_poses(gt), read_poses(est)
     if len(T_gt) != len(T_est):
         raise ValueError(f"{est}: {len(T_est)} poses, but {gt} has {len(T_gt)}; both must cover "
@@ -423,7 +422,7 @@ def _read_pair(gt, est):
 
 
 def _report(trajectories):
-    """{name: (T_gt, T_est)} -> the table of all errors."""
+    """Format the errors of {name: (T_gt, T_est)} as a table."""
     rows, segments, steps = [], [], []
     for name, (T_gt, T_est) in trajectories.items():
         segments.append(segment_errors(T_gt, T_est))
@@ -441,7 +440,7 @@ def _report(trajectories):
 
 
 def main(argv=None):
-    """The command line -> exit code: 0, or 2 for bad input."""
+    """Run the command line. Returns the exit code: 0, or 2 for bad input."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("gt", metavar="GT", type=Path, help=(
