@@ -273,7 +273,7 @@ def test_scan_geometry_samples_and_groups_the_usable_points(seed):
                        [1e30, 0, 0, 0]])
     scan = np.insert(usable, rng.integers(1, 200, len(junk)), junk, axis=0)
     g, xyz = scan_geometry(scan, SMALL), usable[:, :3]
-    assert g["broken"] == 4  # a point that is only too far away is not broken
+    assert g["broken"] == 4  # a point that is only too far away is not invalid
 
     centroids = fps_textbook(xyz, 32)
     assert_array_equal(g["xyz"], xyz[centroids])
@@ -308,7 +308,7 @@ def euler_pose(v):
 
 @given(SEED, st.lists(st.integers(0, 5), max_size=3))
 @settings(max_examples=100)
-def test_vectors_are_extrinsic_xyz_of_any_leading_shape_and_survive_the_round_trip(seed, shape):
+def test_vectors_of_any_leading_shape_are_extrinsic_xyz_and_survive_the_round_trip(seed, shape):
     v = generator(seed).uniform(-1, 1, (*shape, 6)) * [100, 100, 100, 179.9, 89, 179.9]
     T = from_vector(v)
     expected = np.reshape([euler_pose(row) for row in v.reshape(-1, 6)], (*shape, 4, 4))
@@ -371,7 +371,7 @@ def test_the_default_config_is_that_of_the_paper():
 
 
 class OnlyOnMeta(torch.utils._python_dispatch.TorchDispatchMode):
-    """Fail for every operation that returns a tensor on another device."""
+    """Fail if an operation returns a tensor on another device."""
 
     def __torch_dispatch__(self, function, types, arguments=(), options=None):
         result = function(*arguments, **options or {})
@@ -405,7 +405,7 @@ CONFIGS = {
 
 
 def compare_fast_and_plain(net, batch, training, rng):
-    """Assert that predictions, gradients and running statistics of `d3dlo.fast(net)` are right.
+    """Assert that `d3dlo.fast(net)` has the predictions, gradients and statistics of the plain net.
 
     Returns the predictions and the two networks, fast and plain.
     """
@@ -431,7 +431,7 @@ def test_the_fast_network_equals_the_plain_one(training, config, seed):
     net, batch = random_net(rng, config).double(), in_double(random_batch(rng, config)[0])
     y_hat, fast, plain = compare_fast_and_plain(net, batch, training, rng)
     assert y_hat.std(0).min() > 1e-3  # predictions of different pairs differ
-    # The only layers they have in common are those that `fast` does not replace
+    # They share only the types of layers that `fast` does not replace
     assert {type(m) for m in fast.modules()} & {type(m) for m in plain.modules()} == {
         D3DLO, torch.nn.Sequential, torch.nn.Linear, torch.nn.BatchNorm1d, torch.nn.ReLU}
 
@@ -584,7 +584,7 @@ def test_batches_depend_on_seed_and_step_alone(seed, swap, augmented, batch):
 
 
 @given(SEED, st.sampled_from(["both", "random"]), st.integers(2, 12))
-def test_an_epoch_has_every_pair_once_with_the_motion_of_its_direction(seed, swap, batch):
+def test_an_epoch_has_every_pair_once_with_the_motion_in_its_direction(seed, swap, batch):
     config = replace(SMALL, swap=swap, batch=batch)
     geometry, motions = random_sequences()
     scan_of = {}  # (sequence, scan) of each scan, by its points
@@ -642,7 +642,7 @@ def test_augmented_pairs_still_fit_their_motion(seed):
         assert np.abs(X - Y).max() > 1e-3  # something moved
         left_to_right = np.sign(p["xyz"][0, 1] * old["xyz"][0, 1])
         assert_array_equal(p["xyz"] * [1, left_to_right, 1], old["xyz"])
-    # Nothing but the coordinates has changed
+    # Only the coordinates have changed
     before["xyz"], before["group_sa1"][..., 1:] = scans["xyz"], scans["group_sa1"][..., 1:]
     assert before.tobytes() == scans.tobytes()
 
@@ -693,7 +693,7 @@ def signal_handlers():
 
 
 # Training stops in the eighth of 15 steps, in the middle of an epoch. KeyboardInterrupt ends the
-# step at once, so the last checkpoint is that of step 7; a signal lets the step finish.
+# step at once, so the last checkpoint is from step 7. A signal lets the step finish.
 @pytest.mark.parametrize("stop, last_step, schedule, optimizer, frozen", [
     (KeyboardInterrupt, 7, "steps", "adam", 0),
     (KeyboardInterrupt, 7, "one-cycle", "muon", 8 / 15),
@@ -946,7 +946,7 @@ DRIVES |= {f"real {file.stem}": real_path(file)
 
 @table("drive", DRIVES)
 @given(seed=SEED, n=st.integers(2, 450), size=st.sampled_from([0, 1e-5, 0.02, 20]))
-def test_segment_errors_equal_the_devkits_and_step_errors_the_errors_added(drive, seed, n, size):
+def test_segment_errors_equal_the_devkits_and_step_errors_are_those_added(drive, seed, n, size):
     rng = generator(seed)
     T_gt = drive(rng, n)
     E = random_motion(rng, size, len(T_gt) - 1)
@@ -1459,7 +1459,7 @@ except OSError as error:
 """
 
 
-def test_a_script_without_a_main_guard_gets_an_error_that_shows_it(tmp_path):
+def test_a_script_without_a_main_guard_gets_an_error_that_explains_it(tmp_path):
     (tmp_path / "script.py").write_text(UNGUARDED)
     environment = os.environ | {"PYTHONPATH": str(HERE)}
     ran = subprocess.run([sys.executable, tmp_path / "script.py"], env=environment, timeout=60,
@@ -1493,14 +1493,14 @@ def test_a_weights_file_is_enough_to_rebuild_its_network(tmp_path, config):
 
 @pytest.fixture(scope="session")
 def new_drive(tmp_path_factory):
-    """A simulated sequence that the shipped weights have not seen, and its geometry for them."""
+    """A simulated sequence that the pretrained weights have not seen, and its geometry."""
     root = tmp_path_factory.mktemp("new")
     s, = kitti.open_sequences(kitti.simulate(root, seed=1, sequences=["06"], scans=8, workers=1))
     config = load_weights()[0].config
     return s, np.stack([scan_geometry(s.scan(i), config) for i in range(8)])
 
 
-def test_the_shipped_weights_are_accurate_on_an_unseen_sequence(new_drive):
+def test_the_pretrained_weights_are_accurate_on_an_unseen_sequence(new_drive):
     (s, records), (net, _) = new_drive, load_weights()
     poses = d3dlo.accumulate(d3dlo.predict_motions(net, records, refine=1))
     moved = np.linalg.norm(s.motions()[:, :3, 3], axis=1)
@@ -1509,7 +1509,7 @@ def test_the_shipped_weights_are_accurate_on_an_unseen_sequence(new_drive):
 
 
 @torch.inference_mode()
-def test_in_bfloat16_the_shipped_weights_predict_nearly_the_same(new_drive):
+def test_in_bfloat16_the_pretrained_weights_predict_nearly_the_same(new_drive):
     (_, records), (net, _) = new_drive, load_weights()
     p, q = np.r_[:7, 1:8], np.r_[1:8, :7]  # both directions
     batch = d3dlo.make_batch(records, p, q, net.config)
@@ -1536,7 +1536,7 @@ def test_odometry_multiplies_relative_poses_and_a_refused_scan_changes_nothing(t
         assert pose.shape == (4, 4) and pose.dtype == float
         assert_allclose(pose, expected, atol=1e-9)
         pose[:] = 0  # it is a copy, so the next pose is not affected
-    # Several pairs in a batch give the same
+    # Predicting several pairs in one batch gives the same poses
     records = np.stack([scan_geometry(scan, SMALL) for scan in scans])
     together = d3dlo.predict_motions(net, records, batch=3)
     assert_allclose(d3dlo.accumulate(together)[-1], expected, atol=1e-3)
@@ -1545,7 +1545,7 @@ def test_odometry_multiplies_relative_poses_and_a_refused_scan_changes_nothing(t
 @given(SEED)
 def test_refining_averages_both_directions_then_predicts_the_residual_motion(seed):
     def one_way(p, q):
-        """In place of the network: small, smooth, and different in the two directions."""
+        """Replace the network by a small, smooth motion that differs in the two directions."""
         return from_vector((p["xyz"][:2] - 0.7 * q["xyz"][1:3]).ravel() / 10)
 
     def predict_one_way(net, scans, p, q, device):
@@ -1662,7 +1662,7 @@ def test_domain_shift_names_each_statistic_out_of_range(factors, spread):
         assert (name in shift) == (x < a / 1.5 or x > b * 1.5)
 
 
-def test_odometry_and_eval_warn_once_of_domain_shift_and_of_broken_points(cwd, capsys):
+def test_odometry_and_eval_warn_once_about_domain_shift_and_invalid_points(cwd, capsys):
     save_weights(cwd / "w.pt", seen=[[1e5, 0.1, 1, 0.01], [2e5, 1, 100, 1]])
     odometry = d3dlo.Odometry(cwd / "w.pt")
     scans = [random_scan(generator(i), 1100) for i in range(3)]
@@ -1841,7 +1841,7 @@ def test_train_stores_a_run_that_eval_reads_and_nothing_overwrites(cwd, city, ca
     assert (run / "log.txt").read_text() == out
     assert d3dlo.main(["eval", "--data", "data", "--weights", "run", "--out", "out"]) == 0
     results, out = results_of("out"), capsys.readouterr().out
-    # 07 is held out, so the training run has evaluated it at the end
+    # 07 is held out, so the training run evaluated it at the end
     assert results["sequences"]["07"] == trained["sequences"]["07"]
     assert [s["trained_on"] for s in results["sequences"].values()] == [True, False]
     assert results["pooled"]["trained_on"]  # because one of them was
@@ -1914,7 +1914,7 @@ def test_training_settings_do_not_change_the_network_and_input_of_given_weights(
 
 @table("out", {"the root": "root", "poses": "root/poses", "below poses": "root/poses/new",
                "a sequence": "root/sequences/00", "a link": "link", "dots": "root/poses/../poses"})
-def test_an_output_folder_among_the_data_is_refused(cwd, capsys, out):
+def test_an_output_folder_inside_the_data_folder_is_refused(cwd, capsys, out):
     write_root(cwd / "root", size=60)
     (cwd / "link").symlink_to("root/poses")
     save_weights("w.pt", SMALL)
@@ -2316,7 +2316,7 @@ def test_a_raw_drive_is_converted_with_poses_at_the_times_of_its_scans(cwd, caps
     assert files_of(cwd) == before
 
 
-def test_scans_of_a_raw_drive_are_copied_where_they_cannot_be_linked(cwd, monkeypatch):
+def test_scans_of_a_raw_drive_are_copied_if_they_cannot_be_linked(cwd, monkeypatch):
     write_raw(cwd)
     before = files_of(DRIVE)
     def refuse(source, target):
@@ -2566,7 +2566,7 @@ def l1(y_hat, y):
 
 
 def eq_5(y_hat, y):
-    """Mean over the pairs; a length below 0.001 counts as 0.001."""
+    """Eq. 5, the mean over the pairs. A length below 0.001 counts as 0.001."""
     lengths = [np.maximum(np.linalg.norm(part, axis=1), 1e-3) for part in (y_hat, y)]
     return np.mean(1 - np.sum(y_hat * y, 1) / lengths[0] / lengths[1])
 

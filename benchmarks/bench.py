@@ -9,12 +9,11 @@ Every measurement runs in a process of its own. In each round the baseline and t
 turns, so a busy machine slows both. The table shows the median time of each, and the median and
 range of their ratio over the rounds.
 
-With --against, DIR holds another version of d3dlo.py with today's interface; its code is the
-baseline of all rows that do not compare with something else.
+With --against, DIR holds another version of d3dlo.py with the current interface. Its code is the
+baseline.
 
-The row `metric` needs the test packages, pip install ".[test]". Other packages are compared with
-when they are installed: pip install fpsample kiss-icp. Linux only. Keep the machine free of other
-work.
+The row `metric` needs the test packages, pip install ".[test]". fpsample and kiss-icp are baselines
+if they are installed. Linux only. Run nothing else on the machine.
 """
 import argparse
 import functools
@@ -34,7 +33,7 @@ import numpy as np
 import torch
 
 HERE = Path(__file__).resolve().parents[1]
-sys.path.insert(0, os.environ.get("D3DLO_CHECKOUT", str(HERE)))  # a child may measure another one
+sys.path.insert(0, os.environ.get("D3DLO_CHECKOUT", str(HERE)))  # of a child: another checkout
 import d3dlo
 import kitti
 import metrics
@@ -43,15 +42,16 @@ from d3dlo import Config
 CONFIG = Config(max_range=50.0, plane=True, batch=16, optimizer="adam", lr=1e-3, schedule="steps",
                 swap="both", augment=True, frozen=0.0)  # both directions: 32 pairs in a batch
 SCANS = 33  # scans prepared for training and inference, so 32 pairs
-STEPS, WARM_UP = 12, 4  # training steps measured, and how many of them do not count
+STEPS, WARM_UP = 12, 4  # training steps; the first WARM_UP are not counted
 KITTI_PAIRS = 15960  # pairs of the training split
 KITTI_POSES = 4541, 1101, 4661, 801, 271, 2761, 1101, 1101, 4071, 1591, 1201  # 00 to 10
 
 
-# Measurements: a `kitti.Sequence` and a form -> seconds. The form "here" is what users run.
+# Measurements: functions of a `kitti.Sequence` and a form, which return seconds. The form "here" is
+# what users run.
 
 def seconds(work, repeat=9):
-    """Median time of a call, without the first."""
+    """Median time of a call, not counting the first."""
     times = []
     for _ in range(1 + repeat):
         start = time.perf_counter()
@@ -66,7 +66,7 @@ def one_core():
 
 
 def fps(s, form):
-    """1,024 of the points of a scan."""
+    """Farthest point sampling of 1,024 points of a scan."""
     one_core()
     xyz = np.ascontiguousarray(s.scan(len(s) // 2)[:, :3])
     if form == "textbook loop":
@@ -81,7 +81,7 @@ def fps(s, form):
 
 
 def geometry(s, form):
-    """`scan_geometry` of a scan."""
+    """Sampling and grouping of a scan, by `scan_geometry`."""
     one_core()
     if form == "textbook FPS":
         d3dlo.farthest_point_sampling = d3dlo.fps_textbook
@@ -90,7 +90,7 @@ def geometry(s, form):
 
 
 def register(s, form, refine=0):
-    """A scan of a stream, scans in memory."""
+    """Registering a scan of a stream; the scans are in memory."""
     scans = [s.scan(i) for i in range(min(SCANS, len(s)))]
     if form == "KISS-ICP":
         from kiss_icp.config import KISSConfig
@@ -105,7 +105,7 @@ def register(s, form, refine=0):
 
 
 def prepare(s, form):
-    """The network in one of its forms, and records and motions of a sequence, as `fit` takes them.
+    """Prepare the network in one of its forms, and records and motions of a sequence for `fit`.
 
     Forms: "plain" and "here", the fast one; either may be "compiled"; "default malloc" is the fast
     one without `keep_freed_memory`.
@@ -125,7 +125,7 @@ def prepare(s, form):
 
 
 def inference(s, form):
-    """The network on a pair, of 32 in a batch; sampling and grouping not included."""
+    """The network on one of 32 pairs in a batch, without sampling and grouping."""
     net, geometry, motions = prepare(s, form)
     pairs = [(0, i) for i in range(min(16, len(motions[0])))]
     batch, _ = d3dlo.training_batch(geometry, motions, pairs, CONFIG, np.random.default_rng(0))
@@ -135,9 +135,9 @@ def inference(s, form):
 
 
 def training_steps(net, geometry, motions, batches, frozen=False):
-    """Train on the first STEPS batches, and only make the others. Returns seconds per pair."""
+    """Train on the first STEPS batches and prepare the others. Returns seconds per pair."""
     run = d3dlo.Training(net, geometry, motions, "")
-    run.model = net  # in the form that is measured
+    run.model = net  # the form to measure
     run.frozen_from = -1 if frozen else batches
     times, last = [], time.perf_counter()
     for i, (batch, T) in enumerate(d3dlo.batches(geometry, motions, CONFIG, (0,), 0, batches)):
@@ -149,12 +149,12 @@ def training_steps(net, geometry, motions, batches, frozen=False):
 
 
 def training(s, form):
-    """A training step, divided by the pairs in its batch; batches are made meanwhile."""
+    """A training step, divided by the pairs in its batch. Batches are prepared in parallel."""
     return training_steps(*prepare(s, form), STEPS)
 
 
 def fixed_statistics(s, form):
-    """The same with BatchNorm's statistics fixed, as at the end of training."""
+    """A training step with fixed BatchNorm statistics, as at the end of training."""
     return training_steps(*prepare(s, form), STEPS, frozen=True)
 
 
@@ -169,7 +169,7 @@ def cache(s, form):
 
 
 def start_up(s, form):
-    """The command line, up to its help."""
+    """Starting the command line and printing its help."""
     command = ["-c", form] if form == "import torch" else [HERE / "d3dlo.py", "--help"]
     return seconds(lambda: subprocess.run([sys.executable, *command], check=True,
                                           capture_output=True), 3)
@@ -189,7 +189,7 @@ def metric(s, form):
 
 
 def memory(s, form):
-    """Training on as many pairs as KITTI's training split, every record of its cache read once.
+    """Training on as many pairs as KITTI's training split has, reading every record once.
 
     Returns peak resident memory, the part of it that is not pages of the cache, and the size of
     the cache, in GiB.
@@ -214,7 +214,7 @@ def memory(s, form):
 # The table
 
 class Row(NamedTuple):
-    """A measurement, what it is called in the table, and the forms that it is compared with."""
+    """A measurement, its name in the table, and the forms to compare with."""
 
     measure: Callable
     work: str
@@ -238,12 +238,12 @@ ROWS = {
     "memory": Row(memory, "memory of training"),
 }
 VERSIONS = "fps", "geometry", "register", "refine", "training", "fixed", "inference"  # --against
-SLOW = "malloc", "compiled", "memory"  # only when asked for
+SLOW = "malloc", "compiled", "memory"  # run only if named
 PACKAGES = {"fpsample exact": "fpsample", "fpsample buckets": "fpsample", "KISS-ICP": "kiss_icp"}
 
 
 def in_child(name, form, s, checkout=HERE):
-    """Measure in a process of its own, with the code of a checkout -> the numbers."""
+    """Measure in a separate process, with the code of a checkout. Returns the numbers."""
     command = [sys.executable, __file__, "--child", name, form, s.folder.parents[1], s.name]
     done = subprocess.run(command, capture_output=True, text=True,
                           env=os.environ | {"D3DLO_CHECKOUT": str(checkout)})
@@ -253,12 +253,12 @@ def in_child(name, form, s, checkout=HERE):
 
 
 def child(name, form, root, sequence):
-    """The process of `in_child`: print the numbers."""
+    """Run in the process of `in_child`: measure and print the numbers."""
     print(*np.atleast_1d(ROWS[name].measure(kitti.Sequence(root, sequence), form)))
 
 
 def compare(name, s, rounds, against=None):
-    """Print a line of the table for each baseline: those of the row, or another checkout."""
+    """Print a line of the table for each baseline, or for another checkout if there is one."""
     forms = [form for form in ROWS[name].baselines
              if form not in PACKAGES or importlib.util.find_spec(PACKAGES[form])]
     works = {form: (form, HERE) for form in forms}
@@ -285,7 +285,7 @@ def processor():
 
 
 def main():
-    """The command line."""
+    """Run the command line."""
     if sys.argv[1:2] == ["--child"]:
         return child(*sys.argv[2:])
     parser = argparse.ArgumentParser(description=__doc__,

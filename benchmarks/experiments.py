@@ -1,18 +1,18 @@
-"""The paper's experiments, from data to a table: our figures beside the paper's.
+"""Run the paper's experiments and print our figures beside the paper's.
 
     python benchmarks/experiments.py table2 --dry-run      # list the runs and estimate their time
     python benchmarks/experiments.py loss coordinates      # simulated city, 10,000 pair-steps a run
     python benchmarks/experiments.py table2 table3 --data ROOT --budget 8000000 --seeds 0 1 2
 
-The first half holds what the paper tried and rejected, as losses and as subclasses of D3DLO. Each
-uses one of two hooks of d3dlo.py: the objective of `fit`, and the class of the network.
+The first half holds what the paper tried and rejected, as losses and as subclasses of D3DLO. They
+are passed to `d3dlo.train` as its `objective` and its `network`.
 
-A pair-step is one pair of scans in one direction. All runs of a table have the same number of
-pair-steps, the same batch size, the same data and, seed by seed, the same order of pairs. The
-recipe is the short one, d3dlo.SHORT.
+A pair-step is one pair of scans, in one direction, in one training step. All runs of a table have
+the same number of pair-steps, the same batch size, the same data and, for the same seed, the same
+order of pairs. The recipe is the short one, d3dlo.SHORT.
 
-Every run has a folder in OUT, named by a hash of everything it depends on. A finished run is never
-repeated, an interrupted one is resumed, and tables share runs. Each run uses one core.
+Every run has a folder in OUT, named by a hash of everything it depends on. Finished runs are not
+repeated, interrupted ones are resumed, and tables share runs. Each run uses one core.
 """
 import argparse
 import hashlib
@@ -56,8 +56,8 @@ class CosineLoss(nn.Module):
         return f"weight={self.weight}, n={self.n}"
 
     def forward(self, y_hat, y):
-        """(B,6), (B,6) -> ()."""
-        # Eq. 5 is not defined for a motion of zero. `eps` replaces lengths below a millimetre.
+        """Predictions and targets (B,6), (B,6) -> the loss ()."""
+        # Eq. 5 is not defined for a zero vector. `eps` replaces lengths below 0.001.
         cosine = F.cosine_similarity(y_hat[:, :self.n], y[:, :self.n], eps=1e-3)  # (B,)
         return (y - y_hat).abs().mean() + self.weight * (1 - cosine).mean()
 
@@ -182,7 +182,7 @@ class Coordinates(D3DLO):
 
 
 class Variant(NamedTuple):
-    """A row of a table, or several where it is measured on several splits."""
+    """A row of a table, or one row for each split of the experiment."""
 
     paper: str | dict = ""  # the paper's words, or {split: its E_t [%] and E_r [deg/m]}
     changes: dict = {}  # what differs from Config(**SHORT)
@@ -268,8 +268,8 @@ def pair_steps(config, pairs):
 
 
 def config_of(changes, pairs, budget):
-    """The short recipe with changes. The number of epochs follows from the budget; at least one
-    epoch over both directions.
+    """The short recipe with changes. The budget determines the number of epochs, at least one over
+    both directions.
     """
     config = replace(Config(**SHORT), **changes)
     epochs = max(1, round(budget / (2 * pairs)))
@@ -277,8 +277,8 @@ def config_of(changes, pairs, budget):
 
 
 def fingerprint(sequence):
-    """A hash that changes with the data of a sequence. The scans are not read, since they are big:
-    their sizes and modification times stand for them.
+    """A hash that identifies the data of a sequence. Of the scans, which are large, only sizes and
+    modification times are hashed.
     """
     stats = [path.stat() for path in sequence.scan_paths]
     scans = np.array([(s.st_size, s.st_mtime_ns) for s in stats])
@@ -287,7 +287,7 @@ def fingerprint(sequence):
 
 
 def plan(experiments, pairs, budget, seeds, out, data):
-    """{experiment: {variant: [a Run for each seed]}}. data: what identifies the data, for JSON."""
+    """{experiment: {variant: [a Run for each seed]}}. data: identifies the data; fit for JSON."""
     def run(experiment, name, seed):
         variant = EXPERIMENTS[experiment][name]
         config = config_of(variant.changes, pairs, budget)
@@ -301,7 +301,7 @@ def plan(experiments, pairs, budget, seeds, out, data):
 
 
 def seconds_a_step(variant, config):
-    """Time of one core for a pair-step, measured on random points."""
+    """Seconds that one core needs for a pair-step, measured on random points."""
     torch.set_num_threads(1)
     rng = np.random.default_rng(0)
     records = np.zeros(config.batch + 1, d3dlo.geometry_dtype(config))
@@ -326,7 +326,7 @@ CHILDREN = set()  # the processes of training runs under way
 
 
 def run_one(run, root, sequences, evaluated):
-    """Train and evaluate in a process of its own. RuntimeError when that fails."""
+    """Train and evaluate in a separate process. Raises RuntimeError if that fails."""
     job = dict(experiment=run.experiment, variant=run.variant, config=run.config.as_dict(),
                seed=run.seed, folder=str(run.folder), root=str(root), sequences=sequences,
                evaluated=evaluated)
@@ -343,7 +343,7 @@ def run_one(run, root, sequences, evaluated):
 
 
 def run_child(experiment, variant, config, seed, folder, root, sequences, evaluated):
-    """What `run_one` runs: start or resume the training run, then evaluate."""
+    """Start or resume a training run, then evaluate: the process that `run_one` starts."""
     torch.set_num_threads(1)
     kitti.keep_freed_memory()
     kitti.terminate_as_interrupted()
@@ -354,7 +354,7 @@ def run_child(experiment, variant, config, seed, folder, root, sequences, evalua
 
 
 def stop_children(number, frame):
-    """Handle SIGTERM. Ctrl-C in a terminal reaches the children too; SIGTERM must be passed on."""
+    """Pass SIGTERM on to the children. Ctrl-C in a terminal reaches them anyway."""
     for child in list(CHILDREN):
         child.terminate()
     raise KeyboardInterrupt
@@ -367,12 +367,12 @@ def run_all(todo, root, sequences, evaluated, jobs):
         futures = [pool.submit(run_one, run, root, sequences, evaluated) for run in todo]
         for future in kitti.progress(futures, len(futures), "training runs"):
             future.result()
-    finally:  # after an interruption or a failure start no further run
+    finally:  # start no further run after an interruption or a failure
         pool.shutdown(cancel_futures=True)
 
 
 def dry_run(todo, steps, scans, jobs):
-    """Print the Runs of a list, how long they will take and how large the caches are."""
+    """Print a list of Runs, how long they will take and how large their caches will be."""
     seconds, total = {}, 0  # of a variant; of all runs
     for run in todo:
         key = run.experiment, run.variant
@@ -404,7 +404,7 @@ def figures(run, split):
 
 
 def cell(values, digits):
-    """The mean over the seeds and, when there are several, their range."""
+    """Format the mean over the seeds and, if there are several, their range."""
     if np.isnan(values).any():
         return "-"
     mean, low, high = (f"{x:.{digits}f}" for x in (values.mean(), values.min(), values.max()))
@@ -412,7 +412,7 @@ def cell(values, digits):
 
 
 def markdown(experiment, runs, words):
-    """The table of an experiment."""
+    """The table of an experiment in Markdown, followed by `words`."""
     lines = [HEADER, ["---"] * len(HEADER)]
     for name, of_seeds in runs.items():
         variant = EXPERIMENTS[experiment][name]
@@ -443,7 +443,7 @@ def write_table(experiment, runs, out, words):
 
 
 def command_line():
-    """The arguments."""
+    """Parse the arguments."""
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
@@ -479,7 +479,7 @@ def caption(experiment, args, trained, pairs, steps):
 
 
 def check_splits(root, experiments, names):
-    """ValueError when a split that an experiment is measured on has no sequence."""
+    """Raise ValueError if a split that an experiment is measured on has no sequence."""
     for split in dict.fromkeys(split for name in experiments for split in splits_of(name)):
         if split != "all" and not set(kitti.SPLITS[split]) & set(names):
             raise ValueError(f"{root}: has none of the sequences of the {split} split, "
@@ -487,7 +487,7 @@ def check_splits(root, experiments, names):
 
 
 def main():
-    """The command line. ValueError, OSError, RuntimeError, KeyboardInterrupt."""
+    """Run the command line."""
     if sys.argv[1:2] == ["--child"]:
         return run_child(**json.loads(sys.argv[2]))
     args = command_line()

@@ -1,13 +1,13 @@
-"""Feed damaged and hostile files to every reader.
+"""Feed damaged and malicious files to every reader.
 
     python benchmarks/fuzz.py  # 20,000 inputs, some minutes of one core
     python benchmarks/fuzz.py --inputs 500 --seed 7
 
 A valid file is truncated, emptied, overwritten with noise, spliced, given other numbers (NaN,
 infinite, huge) or other settings, or replaced by another kind of file, among them pickles that run
-code. A reader must either return an answer that is sound, or raise ValueError or OSError with one
-line that names the file. A cache and weights must be those that were written. Failures are any
-other exception, an unsound answer, more than 20 seconds, and code that ran.
+code. A reader must return a valid result, or raise ValueError or OSError with a one-line message
+that names the file. A cache or weights that it accepts must equal those that were written. All else
+is a failure: another exception, an invalid result, more than 20 seconds, or code that was run.
 """
 import argparse
 import collections
@@ -51,14 +51,14 @@ NAME_PARTS = ["..", "/", "\\", "\0", "etc", "00", "~", " ", "\n", "C:", ".", "*"
 # Inputs
 
 class Bomb:
-    """Leaves a folder behind when it is unpickled."""
+    """Makes a folder when it is unpickled."""
 
     def __reduce__(self):
         return os.mkdir, ("it-ran",)
 
 
-def hostile_files():
-    """Files that run code when they are read without care, and an archive of 200 MB of zeros."""
+def malicious_files():
+    """Files that run code when an unsafe reader opens them, and an archive of 200 MB of zeros."""
     torch.save(Bomb(), saved := io.BytesIO())
     np.save(array := io.BytesIO(), np.array([Bomb()], dtype=object), allow_pickle=True)
     with zipfile.ZipFile(zeros := io.BytesIO(), "w", zipfile.ZIP_DEFLATED) as archive:
@@ -67,17 +67,17 @@ def hostile_files():
 
 
 def truncate(rng, good, others):
-    """The start of the file, maybe nothing of it."""
+    """Keep only the start of the file, or nothing."""
     return good[:rng.integers(len(good))] if rng.random() < 0.5 else b""
 
 
 def noise(rng, good, others):
-    """Random bytes instead of the file."""
+    """Replace the file by random bytes."""
     return rng.bytes(int(rng.integers(1, 5000)))
 
 
 def flip_bits(rng, good, others):
-    """Up to 20 bits flipped."""
+    """Flip up to 20 bits."""
     data = bytearray(good)
     for i in rng.integers(len(data), size=rng.integers(1, 20)):
         data[i] ^= 1 << int(rng.integers(8))
@@ -85,43 +85,43 @@ def flip_bits(rng, good, others):
 
 
 def overwrite(rng, good, others):
-    """Noise over a stretch, or inserted."""
+    """Overwrite a part with random bytes, or insert them."""
     at, n = rng.integers(len(good) + 1), int(rng.integers(1, 200))
     return good[:at] + rng.bytes(n) + good[at + n * rng.integers(2):]
 
 
 def replace_word(rng, good, others):
-    """Another number or word in a text."""
+    """Replace a word in a text."""
     words = good.split(b" ")
     words[rng.integers(len(words))] = WORDS[rng.integers(len(WORDS))]
     return b" ".join(words)
 
 
 def replace_floats(rng, good, others):
-    """Another number in a binary file of float32."""
+    """Replace numbers in a binary file of float32."""
     values = np.frombuffer(good[:len(good) // 4 * 4], "<f4").copy()
     values[rng.integers(len(values), size=rng.integers(1, len(values) + 1))] = rng.choice(FLOATS)
     return values.tobytes()
 
 
 def repeat(rng, good, others):
-    """The file two or three times over."""
+    """Repeat the content two or three times."""
     return good * int(rng.integers(2, 4))
 
 
 def other_file(rng, good, others):
-    """Another kind of file."""
+    """Replace the file by one of another kind."""
     return others[rng.integers(len(others))]
 
 
 def shuffle_lines(rng, good, others):
-    """Lines lost, doubled and in disorder."""
+    """Drop, repeat and reorder lines."""
     lines = good.splitlines(keepends=True)
     return b"".join(lines[i] for i in rng.integers(len(lines), size=rng.integers(len(lines) + 1)))
 
 
 def replace_setting(rng, good, others):
-    """Another value somewhere in JSON or in a weights file; other files stay as they are."""
+    """Replace a value in JSON or in a weights file. Other files are not changed."""
     if good.startswith(b"{"):
         return json.dumps(replace_value(rng, json.loads(good))).encode()
     if good.startswith(b"PK"):
@@ -132,7 +132,7 @@ def replace_setting(rng, good, others):
 
 
 def replace_value(rng, tree):
-    """Nested dicts and lists with one value replaced, at a random place and depth."""
+    """Replace one value in nested dicts and lists, at a random place and depth."""
     if not isinstance(tree, (dict, list)) or not tree or rng.random() < 0.1:
         return VALUES[rng.integers(len(VALUES))]
     keys = list(tree) if isinstance(tree, dict) else range(len(tree))
@@ -145,7 +145,7 @@ MUTATIONS = [truncate, noise, flip_bits, overwrite, replace_word, replace_floats
              other_file, shuffle_lines, replace_setting]
 
 
-# Readers: each has a valid file, a function that reads it, and a check of the answer
+# Readers: each has a valid file, a function that reads it, and a check of the result
 
 def finite(array, *shape):
     """Whether an array has the shape (None: any length) and finite numbers."""
@@ -169,8 +169,8 @@ def read_cache(path):
     return np.load(path)
 
 
-def sound_run(run):
-    """Whether the answer of `read_run` has the types that `train` relies on."""
+def valid_run(run):
+    """Whether the result of `read_run` has the types that `train` relies on."""
     config, data, sequences, seed, weights = run
     return (isinstance(config, Config)
             and all(path is None or isinstance(path, str) for path in (data, weights))
@@ -196,8 +196,8 @@ def make_readers(folder, rng):
                train={"00": "0" * 16}, before=["1" * 16], mean_motion=[0.0] * 6,
                seen=[[1.0] * len(kitti.STATS)] * 2)
 
-    def sound_weights(answer):
-        net, state = answer
+    def valid_weights(result):
+        net, state = result
         fingerprints = [*state["train"].values(), *state["before"]]
         return (all(torch.equal(tensor, model[name]) for name, tensor in net.state_dict().items())
                 and all(isinstance(fingerprint, str) for fingerprint in fingerprints)
@@ -210,19 +210,19 @@ def make_readers(folder, rng):
             finite(record["xyz"], 32, 3) and finite(record["group_sa1"], 32, 4, 4))),
         "poses": ("poses.txt", metrics.read_poses, lambda T: finite(T, None, 4, 4)),
         "calibration": ("calib.txt", kitti.read_calib, lambda T: finite(T, 4, 4)),
-        "weights": ("weights.pt", d3dlo.load_weights, sound_weights),
+        "weights": ("weights.pt", d3dlo.load_weights, valid_weights),
         "cache": ("cache.npy", read_cache, lambda read: read.tobytes() == rows.tobytes()),
-        "run": ("config.json", lambda path: d3dlo.read_run(path.parent), sound_run),
+        "run": ("config.json", lambda path: d3dlo.read_run(path.parent), valid_run),
     }
     return {name: (folder / file, *rest) for name, (file, *rest) in readers.items()}
 
 
 def outcome_of(read, source, check, named):
-    """"right", "refused", or what went wrong. `named`: whether a message names the source."""
+    """Return "right", "refused", or what went wrong. named: whether a message names the source."""
     began = time.monotonic()
     try:
-        answer = read(source)
-        outcome = "right" if check(answer) else "an unsound answer"
+        result = read(source)
+        outcome = "right" if check(result) else "an invalid result"
     except (ValueError, OSError) as error:
         outcome = "refused" if named(str(error)) else f"not one line with its name: {error!r:.300}"
     except Exception as error:
@@ -234,7 +234,7 @@ def outcome_of(read, source, check, named):
 
 
 def try_file(reader, mutation, rng, others):
-    """Read a mutated file -> outcome and the bytes that were read."""
+    """Read a mutated file. Returns the outcome and the bytes that were read."""
     path, read, check = reader
     good = path.read_bytes()
     data = mutation(rng, good, others)
@@ -245,7 +245,7 @@ def try_file(reader, mutation, rng, others):
 
 
 def try_name(root, rng):
-    """Open a sequence by a name that leads elsewhere, or nowhere -> outcome and the name."""
+    """Open a sequence by a random, possibly dangerous name. Returns the outcome and the name."""
     name = "".join(rng.choice(NAME_PARTS, rng.integers(1, 6)))
     return outcome_of(lambda name: kitti.open_sequences(root, [name]), name,
                       lambda sequences: [s.name for s in sequences] == ["00"],
@@ -253,7 +253,7 @@ def try_name(root, rng):
 
 
 def main():
-    """The command line -> exit code: 1 when there are failures."""
+    """Run the command line. Returns the exit code: 1 if there are failures."""
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--inputs", type=int, default=20000, metavar="N", help=(
@@ -267,7 +267,7 @@ def main():
         readers = make_readers(Path(folder), rng)
         for name, (path, read, check) in readers.items():
             assert check(read(path)), name
-        others = [path.read_bytes() for path, *_ in readers.values()] + hostile_files()
+        others = [path.read_bytes() for path, *_ in readers.values()] + malicious_files()
         kitti.simulate("root", sequences=("00",), scans=1, azimuth=100)
         kinds = [*readers, "sequence name"]
         for i in kitti.progress(range(args.inputs), args.inputs, "inputs"):
@@ -279,8 +279,8 @@ def main():
                 outcome, data = try_name("root", rng)
             if outcome not in ("right", "refused"):
                 failures += 1
-                how = f", {mutation.__name__}" if kind in readers else ""
-                print(f"input {i}, {kind}{how}: {outcome}; {len(data)} bytes, {data[:200]!r}",
+                change = f", {mutation.__name__}" if kind in readers else ""
+                print(f"input {i}, {kind}{change}: {outcome}; {len(data)} bytes, {data[:200]!r}",
                       flush=True)
                 outcome = "failed"
             counts[kind, outcome] += 1

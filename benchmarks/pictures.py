@@ -26,7 +26,7 @@ import metrics
 
 
 def scatter(axis, points, size, color, **style):
-    """Points (n,3) from above, the x axis up: the vehicle drives upwards."""
+    """Draw points (n,3) from above, with the x axis up: the vehicle drives upwards."""
     axis.scatter(points[:, 1], points[:, 0], s=size, color=color, linewidths=0, **style)
 
 
@@ -38,7 +38,7 @@ def window(axis, centre, half, title):
 
 
 def draw_ball(axis, points, neighbours, centroid, r, title):
-    """The points around a centroid, its neighbours among them, and the ball of radius r."""
+    """Draw the points around a centroid, its neighbours, and the ball of radius r."""
     scatter(axis, points, 3, "0.7")
     scatter(axis, neighbours, 14, "black")
     turn = np.linspace(0, 2 * np.pi, 100)
@@ -48,7 +48,7 @@ def draw_ball(axis, points, neighbours, centroid, r, title):
 
 
 def draw_flow(axis, xyz_p, xyz_q, centroid, k):
-    """A centroid of P and its k neighbours among the centroids of Q."""
+    """Draw a centroid of P and its k neighbours among the centroids of Q."""
     neighbours = xyz_q[d3dlo.group_knn(xyz_q, centroid[None], k)[0]]
     axis.scatter(xyz_q[:, 1], xyz_q[:, 0], s=14, facecolors="none", edgecolors="0.5",
                  linewidths=0.8, label="Q")
@@ -61,7 +61,7 @@ def draw_flow(axis, xyz_p, xyz_q, centroid, k):
 
 
 def method(root, name, i):
-    """Centroids of scan i, a ball of SA1 and of SA2, and the neighbours of the flow embedding."""
+    """Draw the centroids of scan i, a ball of SA1 and of SA2, and a group of the flow embedding."""
     config = d3dlo.load_weights()[0].config
     s = kitti.Sequence(root, name)
     if not 0 <= i < len(s) - 1:
@@ -88,7 +88,7 @@ def method(root, name, i):
 
 
 def network():
-    """Fig. 1: the blocks with their outputs and parameters."""
+    """Draw Fig. 1: the blocks with their outputs and parameters."""
     net = d3dlo.D3DLO()
     parameters = {name: sum(p.numel() for p in block.parameters())
                   for name, block in net.named_children()}
@@ -129,7 +129,7 @@ COLOURS = {"truth": "0.6", "plain": "tab:orange", "refined": "tab:blue", "KISS-I
 
 
 def paths(root, plain, refined, names):
-    """The true and the predicted paths of sequences from above, all to the same scale."""
+    """Draw the true and the predicted paths of sequences from above, all at the same scale."""
     drives = []
     for s in kitti.open_sequences(root, names):
         simulated = (s.folder / "simulated.json").exists()
@@ -164,7 +164,7 @@ TRUTH_NOISE = {"drive0013": 0.015, "drive0005": 0.024}
 
 
 def steps(plain, refined):
-    """Bars: the error of a step on the real drives, plain, refined and of KISS-ICP."""
+    """Draw bars: the error of a step on the real drives, plain, refined and of KISS-ICP."""
     results = {label: json.loads((folder / "results.json").read_text())["sequences"]
                for label, folder in (("plain", plain), ("refined", refined))}
     figure = metrics.picture(8, 3)
@@ -188,7 +188,7 @@ def steps(plain, refined):
 
 
 def curve(run):
-    """The mean training loss of each epoch, and the loss on test sequences, from a run's log."""
+    """Draw the training loss and the test loss of each epoch, from a run's log."""
     log = (run / "log.txt").read_text(encoding="utf-8")
     epochs = re.findall(r"^epoch (\d+)/\d+: loss ([\d.]+)(?:, test loss ([\d.]+))?", log, re.M)
     if not epochs:
@@ -206,7 +206,7 @@ def curve(run):
 
 
 def main():
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)

@@ -3,12 +3,12 @@
     python benchmarks/scan_stats.py ROOT [NN ...]  # folder in KITTI odometry layout, with poses
     python benchmarks/scan_stats.py data/full 00 01 02 08 09
 
-Each line averages 8 pairs of consecutive scans, spread evenly over a sequence, cropped as the
-shipped weights crop them:
+Each line averages 8 pairs of consecutive scans, spread evenly over a sequence and cropped as for
+the pretrained weights:
 
     points      number of usable points
     intensity   mean intensity
-    ground      share of points in the fullest 0.3 m of height
+    ground      share of points in the densest 0.3 m of height
     raised      share of centroids more than 0.5 m above the road
 
 Then, for raised centroids by range:
@@ -37,8 +37,8 @@ RAISED = -1.2  # z of a raised centroid is above this [m]; the road is at -1.73 
 
 
 def pair_stats(scan_p, scan_q, T_pq, config):
-    """Two scans and their true motion -> kitti.STATS (4,), share of raised centroids, and for
-    each of these range, thickness, roundness and distance to the next scan (n,4)."""
+    """Two scans and their true motion -> kitti.STATS (4,), the share of raised centroids, and for
+    each of these its range, thickness, roundness and distance to the next scan (n,4)."""
     record = d3dlo.scan_geometry(scan_p, config)
     xyz = record["xyz"].astype(float)
     raised = xyz[xyz[:, 2] > RAISED]  # (n,3)
@@ -53,7 +53,7 @@ def pair_stats(scan_p, scan_q, T_pq, config):
 
 
 def sequence_line(s, config):
-    """The line of the table for a `kitti.Sequence`. ValueError without ground truth."""
+    """The line of the table for a `kitti.Sequence`. Raises ValueError without ground truth."""
     motions = s.motions()
     if not len(motions):
         raise ValueError(f"sequence {s.name} has one scan; two are needed")
@@ -74,7 +74,7 @@ def sequence_line(s, config):
 
 
 def main():
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("root", metavar="ROOT")

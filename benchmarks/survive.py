@@ -4,11 +4,11 @@ those of an uninterrupted run.
     python benchmarks/survive.py  # 50 interruptions, some 15 minutes of one core
     python benchmarks/survive.py --kills 5
 
-An interruption is kill -9, SIGTERM, Ctrl-C or a write that fails as on a full disk. It comes at a
-random moment: during start-up, while the cache is built (it is deleted now and then), or while a
+An interruption is kill -9, SIGTERM, Ctrl-C or a write that fails, as on a full disk. It comes at a
+random moment: during start-up, while the cache is built (it is sometimes deleted), or while a
 checkpoint is written, which happens every half second here. After each interruption every file of
 the run must be readable. At the end two training runs start at once without a cache, and `eval`
-runs while they write.
+reads their files while they write.
 
 Everything happens in a temporary folder. It is kept when a check fails.
 """
@@ -33,8 +33,8 @@ import kitti
 
 TRAIN = ["train", "--data", "drives", "--short", "--batch", "4", "--epochs", "20"]
 LIMIT = 100_000  # bytes; smaller than weights and cache, so writing these fails
-# The command line with frequent checkpoints. First argument: no file may grow beyond so many bytes,
-# or 0. Ctrl-C works again, which a shell's background job ignores.
+# The command line with frequent checkpoints. The first argument limits the size of files, in bytes;
+# 0 is no limit. SIGINT is handled again, since a shell's background job ignores it.
 CHILD = f"""
 import resource, signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -51,14 +51,14 @@ if __name__ == "__main__":
 
 
 def start(arguments, limit=0):
-    """Start the command line in a process group of its own, as a terminal does."""
+    """Start the command line in its own process group, as a terminal does."""
     command = [sys.executable, "-c", CHILD, str(limit), *arguments]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
                             start_new_session=True)
 
 
 def start_training(run):
-    """The arguments that begin the training run or, once it has begun, resume it."""
+    """The arguments that start the training run or, if it has begun, resume it."""
     begun = (run / "config.json").exists()
     return ["train", "--out", str(run), "--resume"] if begun else [*TRAIN, "--out", str(run)]
 
@@ -67,22 +67,22 @@ def finish(process, *codes):
     """Wait for a process. Its exit code must be one of `codes`, and there must be no traceback."""
     output = process.communicate()[0]
     code = process.returncode
-    killed = code < 0  # maybe while Python was importing, which prints a traceback
+    killed = code < 0  # perhaps during an import, which prints a traceback
     if code not in codes or "Traceback" in output and not killed:
         fail(f"exit code {code}, expected one of {codes}:\n{output[-2000:]}")
 
 
 def fail(what):
-    """Stop, and say where the files are."""
+    """Exit with a message that says where the files are."""
     sys.exit(f"survive: {what}\nfiles: {Path.cwd()}")
 
 
 def interrupt(run, rng):
-    """Begin or resume the training run and interrupt it. Returns how, or "finished"."""
-    how = rng.choice(["kill -9", "kill -9", "SIGTERM", "Ctrl-C", "failed write"])
-    if how == "failed write":
+    """Start or resume the training run and interrupt it. Returns the kind, or "finished"."""
+    kind = rng.choice(["kill -9", "kill -9", "SIGTERM", "Ctrl-C", "failed write"])
+    if kind == "failed write":
         finish(start(start_training(run), LIMIT), 2)
-        return how
+        return kind
     process = start(start_training(run))
     try:
         process.wait(rng.uniform(0, 12))
@@ -90,21 +90,21 @@ def interrupt(run, rng):
         return "finished"
     except subprocess.TimeoutExpired:
         pass
-    if how == "kill -9":
+    if kind == "kill -9":
         process.kill()
         process.communicate()
-        return how
-    if how == "Ctrl-C":
+        return kind
+    if kind == "Ctrl-C":
         os.killpg(process.pid, signal.SIGINT)  # a terminal sends it to the whole group
     else:
         process.terminate()
     # 0: it was about to end; a signal: Python had not installed its handlers yet
     finish(process, 0, 130, -signal.SIGINT, -signal.SIGTERM)
-    return how
+    return kind
 
 
 def check_readable(run):
-    """Every file of a training run is missing or complete."""
+    """Check that every file of a training run is missing or complete."""
     try:
         for path in run.glob("*.pt"):
             d3dlo.load_weights(path, checkpoint=path.name == "checkpoint.pt")
@@ -120,7 +120,7 @@ def temporary_files():
 
 
 def equal(a, b):
-    """Whether two contents of weights files are the same, bit by bit."""
+    """Whether the contents of two weights files are the same, bit by bit."""
     if isinstance(a, torch.Tensor):
         return torch.equal(a, b)
     if isinstance(a, dict):
@@ -131,7 +131,7 @@ def equal(a, b):
 
 
 def check_same(run, name="checkpoint.pt"):
-    """A file of a training run is that of the uninterrupted run."""
+    """Check that a file of a training run equals that of the uninterrupted run."""
     a, b = (torch.load(folder / name, weights_only=True) for folder in (run, Path("alone")))
     if not equal(a, b):
         fail(f"{run}/{name} differs from that of the uninterrupted run")
@@ -143,19 +143,19 @@ def interrupted_runs(kills, rng):
     while counts.total() - counts["finished"] < kills:
         if rng.random() < 0.2:
             shutil.rmtree("cache", ignore_errors=True)
-        how = interrupt(run, rng)
-        counts[how] += 1
+        kind = interrupt(run, rng)
+        counts[kind] += 1
         check_readable(run)
         most = max(most, temporary_files())
-        print(f"{counts.total() - counts['finished']}/{kills}: {how}", flush=True)
-        if how == "finished":  # compare, and begin another run
+        print(f"{counts.total() - counts['finished']}/{kills}: {kind}", flush=True)
+        if kind == "finished":  # compare, then start another run
             check_same(run)
             shutil.rmtree(run)
     finish(start(start_training(run)), 0)
     check_same(run)
     check_same(run, "weights.pt")
     print("the same weights and optimiser state after "
-          + ", ".join(f"{n} {how}" for how, n in counts.items())
+          + ", ".join(f"{n} {kind}" for kind, n in counts.items())
           + f"; at most {most} temporary files, now {temporary_files()}", flush=True)
 
 
@@ -177,7 +177,7 @@ def two_runs_at_once():
 
 
 def main():
-    """The command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=50, metavar="N", help=(
