@@ -478,9 +478,9 @@ def make_scheduler(optimizer, config, steps):
 class Training:
     """A training run (section 4): a network, its optimisers, and the files in RUN.
 
-    geometry and motions: two lists with an entry for each sequence, records (n,) and T_{t,t+1}
-    (n-1,4,4). objective: a module (y_hat, y) -> loss, by default eq. 2. facts: values to store with
-    the weights, see `training_facts`.
+    geometry, motions: two lists, with records (n,) and T_{t,t+1} (n-1,4,4) of each sequence.
+    objective: a module (y_hat, y) -> loss. None: eq. 2.
+    facts: values to store with the weights, see `training_facts`.
     """
 
     def __init__(self, net, geometry, motions, run, seed=0, device="cpu", objective=None, **facts):
@@ -504,7 +504,7 @@ class Training:
                        self.total_steps, self.device)
 
     def bn_batches(self):
-        """Yield batches for recomputing BatchNorm's statistics, from another random seed."""
+        """Yield batches for recomputing BatchNorm's statistics, with a random seed of their own."""
         return batches(self.geometry, self.motions, self.config, (self.seed, 2**31), 0,
                        min(25, self.total_steps), self.device)
 
@@ -628,10 +628,12 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", checkpoint=None, say=
         objective=None, test=None, **facts):
     """Train `net` as `net.config` says (section 4). Returns a copy of it for use.
 
-    geometry, motions, run, objective, facts: see `Training`. seed: of pair order and augmentation.
-    checkpoint: the content of a checkpoint to continue from. say: called with each line to report.
+    geometry, motions, run, objective, facts: see `Training`.
+    seed: random seed for pair order and augmentation.
+    checkpoint: the content of a checkpoint to continue from.
+    say: called with each line to report.
     test: geometry and motions of the test sequences. Their loss is reported after every epoch and
-    used for nothing else.
+        used for nothing else.
 
     Every STORE_EVERY seconds and at the end, RUN/checkpoint.pt and RUN/weights.pt are written.
     Ctrl-C lets the current step finish. Raises ValueError if the loss is not finite; nothing is
@@ -699,10 +701,12 @@ def save(path, **state):
 def load_weights(path: str | Path | None = None, network=D3DLO, checkpoint: bool = False):
     """Read a weights file. Returns the network, in eval mode, and the content of the file, a dict.
 
-    path: the file or the folder of a training run, None for the pretrained weights. network: the
-    class of the network, which is built from the settings in the file. checkpoint: read a
-    checkpoint to continue from, not weights. Raises FileNotFoundError if there is no such file, and
-    ValueError if it is damaged or of another kind.
+    path: the file, or the folder of a training run. None: the pretrained weights.
+    network: the class of the network, which is built from the settings in the file.
+    checkpoint: read a checkpoint to continue from, not weights.
+
+    Raises FileNotFoundError if there is no such file, and ValueError if it is damaged or of another
+    kind.
     """
     path = Path(path or PRETRAINED)
     path = path / "weights.pt" if path.is_dir() else path
@@ -942,6 +946,19 @@ def evaluate_sequence(net, state, s, records, out, device="cpu", refine=0):
     return errors
 
 
+def evaluate_sequences(net, state, sequences, out, device, refine):
+    """Predict the trajectories of sequences and write OUT/NN.txt. Returns what `summarize` does."""
+    geometry, fingerprints = load_geometry(sequences, net.config)
+    net = for_device(net, device)
+    clear_results(out)
+    work = progress(zip(sequences, geometry), len(sequences), "registering, sequences")
+    errors = {s.name: evaluate_sequence(net, state, s, records, out, device, refine)
+              for s, records in work}
+    # Sequences are compared by content, since different data may have the same name
+    known = {*state["train"].values(), *state["before"]}
+    return summarize(errors, {s.name: f in known for s, f in zip(sequences, fingerprints)})
+
+
 def evaluate_folder(net, state, s, out, device="cpu", refine=0, plot=False, say=print):
     """Predict the trajectory of a `kitti.ScanFolder`, with poses in the LiDAR's frame.
 
@@ -1006,31 +1023,22 @@ def results_table(results):
             "Velodyne frame. -: no such segment, or no ground truth.")
 
 
-def evaluate_sequences(net, state, sequences, out, device, refine):
-    """Predict the trajectories of sequences and write OUT/NN.txt. Returns what `summarize` does."""
-    geometry, fingerprints = load_geometry(sequences, net.config)
-    net = for_device(net, device)
-    clear_results(out)
-    work = progress(zip(sequences, geometry), len(sequences), "registering, sequences")
-    errors = {s.name: evaluate_sequence(net, state, s, records, out, device, refine)
-              for s, records in work}
-    # Sequences are compared by content, since different data may have the same name
-    known = {*state["train"].values(), *state["before"]}
-    return summarize(errors, {s.name: f in known for s, f in zip(sequences, fingerprints)})
-
-
 def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", refine=0, plot=False,
              say=print, network=D3DLO):
     """Run the command `eval`: write trajectories and results.json, and print a table of errors.
 
-    data: a folder in KITTI's layout or a plain folder of scans, which gives a trajectory only; None
-    for the simulated city. weights: a weights file or the folder of a training run, None for the
-    pretrained weights. sequences: a list of names or splits; None for all of `data` or, in the
-    simulated city, the test and validation splits. out: the folder to write to, None for a new one,
-    results/TIME. device: cpu, cuda or mps. refine: see `predict_refined`. plot: draw OUT/plot.png.
-    say: called with the text to print. network: the class of the network.
+    data: a folder in KITTI's layout, or a plain folder of scans, which gives a trajectory only.
+        None: the simulated city.
+    weights: a weights file or the folder of a training run. None: the pretrained weights.
+    sequences: a list of names or splits. None: all, or the simulated test and validation splits.
+    out: the folder to write to. None: a new one, results/TIME.
+    device: cpu, cuda or mps.
+    refine: number of refinements, see `predict_refined`.
+    plot: also draw OUT/plot.png.
+    say: called with the text to print.
+    network: the class of the network.
 
-    Returns the folder of the results. Raises ValueError if an argument, the weights or the data are
+    Returns the folder `out`. Raises ValueError if an argument, the weights or the data are
     invalid, and OSError if a file cannot be read or written.
     """
     check_device(device)
@@ -1380,17 +1388,19 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
           weights=None, network=D3DLO, objective=None):
     """Run the command `train`: train a network, then evaluate it on the held-out sequences.
 
-    config: a Config; None for the paper's settings or, in the simulated city, the short recipe.
-    data: a folder in KITTI's layout, None for the simulated city. sequences: a list of names or
-    splits to train on, None for the training split. out: the folder RUN, None for a new one,
-    runs/TIME. seed: random seed for initialisation, pair order and augmentation. device: cpu, cuda
-    or mps. resume: continue the training run in `out` with the arguments it was started with;
-    config, data, sequences, seed and weights are then ignored. weights: start from these weights
-    and keep their network and input settings. network, objective: a subclass of D3DLO and a loss,
-    see `Training`.
+    config: a Config. None: the paper's settings or, for the simulated city, the short recipe.
+    data: a folder in KITTI's layout. None: the simulated city.
+    sequences: a list of names or splits to train on. None: see `choose_sequences`.
+    out: the folder of the training run. None: a new one, runs/TIME.
+    seed: random seed for initialisation, pair order and augmentation.
+    device: cpu, cuda or mps.
+    resume: continue the run in `out`. Its config, data, sequences, seed and weights are used again.
+    weights: start from these weights and keep their network and input settings.
+    network: the class of the network.
+    objective: the loss, see `Training`.
 
-    Returns RUN. Raises ValueError if an argument or the data are invalid or the loss is not finite,
-    and OSError if a file cannot be read or written.
+    Returns the folder `out`. Raises ValueError if an argument or the data are invalid or the loss
+    is not finite, and OSError if a file cannot be read or written.
     """
     check_device(device)
     check_number("seed", seed)
@@ -1484,9 +1494,9 @@ def starting_point(run, resume, weights, config, network, seed):
 def training_facts(fingerprints, motions, geometry, before=(), seen=()):
     """Summarise the training data: what a weights file stores about them.
 
-    Fingerprints {name: fingerprint}, motions and geometry describe the data of this training run.
-    before, seen: the fingerprints and the range of the scan statistics of earlier training data,
-    if training starts from other weights.
+    fingerprints: {name of a sequence: fingerprint}.
+    before, seen: the fingerprints and the range of scan statistics of earlier training data, if
+        training starts from other weights.
     """
     stats = [records["stats"] for records in geometry]
     stats = np.concatenate([*stats, np.reshape(seen, (-1, len(kitti.STATS)))])
