@@ -706,22 +706,29 @@ def predict(net, scans, p, q, device):
     return net.decode(y_hat)
 
 
+def mean_motion(motions):
+    """Motions (n,4,4) that differ little -> their mean (4,4), a rigid motion."""
+    motions = np.stack(motions)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_matrix(motions[:, :3, :3]).mean().as_matrix()
+    T[:3, 3] = motions[:, :3, 3].mean(0)
+    return T
+
+
 def predict_refined(net, keyframe, scan, guess, device):
     """Records of P and Q, n samplings of each (n,), and a guess of T_pq -> T_pq (4,4).
 
-    Each pass takes a new sampling of both scans, aligns Q with the estimate so far, predicts the
-    residual motion in both directions, and adds half of each. The result is the mean of the n
+    Each pass takes a new sampling of both scans, aligns Q with the estimate so far, and adds the
+    residual motion, predicted in both directions and averaged. The result is the mean of the n
     estimates, since their errors come mostly from the choice of centroids. Not in the paper.
     """
     T, estimates, forth, back = guess, [], np.array([0, 1]), np.array([1, 0])
     for p, q in zip(keyframe, scan):
         aligned, = move_scans(q[None], T[None])
         T_pq, T_qp = predict(net, np.stack([p, aligned]), forth, back, device)
-        half = from_vector(to_vector(invert(T_pq) @ invert(T_qp)) / 2)  # identity if both agree
-        T = T_pq @ half @ T
+        T = mean_motion([T_pq, invert(T_qp)]) @ T
         estimates.append(T)
-    differences = to_vector(invert(T) @ np.stack(estimates))  # (n,6), of each estimate to the last
-    return T @ from_vector(differences.mean(0))
+    return mean_motion(estimates)
 
 
 def several_samplings(scan, config, n):

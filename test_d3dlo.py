@@ -1671,6 +1671,19 @@ def test_refined_odometry_registers_against_keyframes(tmp_path, seed):
     assert calls == expected and keyframe > 0
 
 
+def test_refined_poses_stay_rigid_in_a_long_drive(tmp_path):
+    """Inverting by transposition must not let rounding errors grow from scan to scan."""
+    rng = generator(0)
+    save_weights(tmp_path / "w.pt", SMALL)
+    odometry = d3dlo.Odometry(tmp_path / "w.pt", refine=1)
+    records = np.zeros(1, d3dlo.geometry_dtype(SMALL))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(d3dlo, "predict", lambda net, scans, p, *_: random_motion(rng, n=len(p)))
+        for _ in range(300):
+            pose = odometry.register_records(records)
+    assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
+
+
 @pytest.mark.parametrize("refine", [-1, 1.5, "1", None, float("nan")])
 def test_an_invalid_number_of_refinements_is_refused(weights, refine):
     scan = np.ones((2000, 4), np.float32)
