@@ -49,6 +49,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from torch import nn
 from torch.optim.swa_utils import update_bn
 
@@ -208,19 +209,36 @@ def scan_geometry(scan: np.ndarray, config: Config = Config()) -> np.ndarray:
     """Sample and group a scan for all three set abstractions: (N,4) -> `geometry_dtype` record.
 
     scan: x, y, z [m] in the Velodyne frame, and intensity 0 to 1. Nothing is learned here, so the
-    record is computed once for every scan and kept. One sampling serves all layers: SA1's centroids
-    are in sampling order, so SA2's centroids are the first n2 of them, and SA3's the first n3.
+    record is computed once for every scan and kept. Raises ValueError if too few points are usable.
+    """
+    scan, broken = usable_scan(scan, config)
+    cloud = np.ascontiguousarray(scan[:, :3])
+    centroids = farthest_point_sampling(cloud, config.sa1.n_fps)  # as fps_textbook, faster
+    return group_scan(scan, broken, centroids, build_tree(cloud), config)
+
+
+def usable_scan(scan, config):
+    """Scan (N,4) -> the points that the network uses (n,4), and the number of invalid points.
+
     Raises ValueError if too few points are usable.
     """
-    sa1, sa2, sa3 = config.sa1, config.sa2, config.sa3
     scan, broken = kitti.usable_points(scan, config.max_range, config.plane)
-    if len(scan) < sa1.n_fps:
+    if len(scan) < config.sa1.n_fps:
         reach = config.max_range or kitti.BROKEN_RANGE
         raise ValueError(f"{len(scan)} usable points (finite, within {reach:.0f} m"
                          f"{'' if config.plane else ', off the ground'}), but the network needs "
-                         f"{sa1.n_fps}; are the coordinates in metres?")
+                         f"{config.sa1.n_fps}; are the coordinates in metres?")
+    return scan, broken
+
+
+def group_scan(scan, broken, centroids, tree, config):
+    """Usable points (N,4), indices of SA1's centroids (n1,), cKDTree of the points -> record.
+
+    One sampling serves all layers: SA1's centroids are in sampling order, so SA2's centroids are
+    the first n2 of them, and SA3's the first n3.
+    """
+    sa1, sa2, sa3 = config.sa1, config.sa2, config.sa3
     cloud = np.ascontiguousarray(scan[:, :3])
-    centroids, tree = sample_and_index(cloud, sa1.n_fps)  # fps_textbook and cKDTree
     neighbours = group_ball(cloud, centroids, sa1.r, sa1.n_n, tree)  # (n1,k1)
 
     out = np.zeros((), geometry_dtype(config))
@@ -382,30 +400,51 @@ def move_scans(scans, T):
     return moved
 
 
-def augment(scans, T_pq, rng):
+KEYFRAME_DISTANCE, KEYFRAME_ANGLE = 5.0, 20.0  # [m], [deg]: Odometry's keyframes when it refines
+ALIGNED = 1 / 3  # share of the pairs in augmented training that are aligned, as refinement does
+
+
+def augment(scans, T_pq, aligned, rng):
     """Mirror half of the pairs left to right, then move every Q by a small random motion.
 
-    Records of scans (2n,), all P and then all Q, and poses (n,4,4) -> the same, changed. For a
-    quarter of the pairs, Q is aligned with P first, so that little motion is left. After mirroring,
-    a point q becomes A q and T_pq becomes T_pq A^-1. Not in the paper.
+    Records of scans (2n,), all P and then all Q, and poses (n,4,4) -> the same, changed. Where
+    `aligned` (n,) is true, Q is aligned with P first, and moved less. After mirroring, a point q
+    becomes A q and T_pq becomes T_pq A^-1. Not in the paper.
     """
     n = len(T_pq)
     mirror = np.where(rng.random((n, 1, 1)) < 0.5, np.diag([1.0, -1, 1, 1]), np.eye(4))
     T_pq = mirror @ T_pq @ mirror
     scale = [0.25, 0.1, 0.03, 0.1, 0.1, 1.0]  # m, degrees; most in yaw: turns are rare
-    small = from_vector(rng.normal(size=(n, 6)) * scale)
-    align = np.where(rng.random((n, 1, 1)) < 0.25, T_pq, np.eye(4))
-    A = small @ align
+    size = np.where(aligned, rng.random(n), 1.0)  # refinement meets errors of all sizes
+    small = from_vector(rng.normal(size=(n, 6)) * scale * size[:, None])
+    A = small @ np.where(aligned[:, None, None], T_pq, np.eye(4))
     return move_scans(scans, np.concatenate([mirror, A @ mirror])), T_pq @ invert(A)
 
 
+def later_scan(motions, i, rng):
+    """Draw a scan up to KEYFRAME_DISTANCE metres farther along the path than scan i.
+
+    motions: T_{t,t+1} (n-1,4,4) of its sequence. The scan is the next one if no other is as near.
+    """
+    ahead = np.cumsum(np.linalg.norm(motions[i:, :3, 3], axis=1))  # distance to i+1, i+2, ... [m]
+    return i + max(1, np.searchsorted(ahead, rng.uniform(0, KEYFRAME_DISTANCE), "right"))
+
+
 def training_batch(geometry, motions, pairs, config, rng, device="cpu"):
-    """Pairs (n,2) of (sequence, scan) -> Batch and the poses T_pq (B,4,4) of its pairs."""
-    scans = np.stack([geometry[s][i + d] for d in (0, 1) for s, i in pairs])  # all P, then all Q
-    T_pq = np.stack([motions[s][i] for s, i in pairs])
-    if config.augment:
-        scans, T_pq = augment(scans, T_pq, rng)
+    """Pairs (n,2) of (sequence, scan) -> Batch and the poses T_pq (B,4,4) of its pairs.
+
+    P is that scan and Q the next one. With augmentation, a share of the pairs are as refinement has
+    them: Q may be several scans later, and is aligned with P up to a small motion.
+    """
     n = len(pairs)
+    aligned = rng.random(n) < ALIGNED if config.augment else np.zeros(n, bool)
+    later = [later_scan(motions[s], i, rng) if a else i + 1 for (s, i), a in zip(pairs, aligned)]
+    scans = np.stack([geometry[s][i] for s, i in pairs]
+                     + [geometry[s][j] for (s, _), j in zip(pairs, later)])  # all P, then all Q
+    T_pq = np.stack([functools.reduce(np.matmul, motions[s][i:j])
+                     for (s, i), j in zip(pairs, later)])
+    if config.augment:
+        scans, T_pq = augment(scans, T_pq, aligned, rng)
     p, q, T_qp = np.arange(n), np.arange(n) + n, invert(T_pq)
     # Both directions of every pair, (P, Q) with T_pq and (Q, P) with its inverse
     p, q, T = np.concatenate([p, q]), np.concatenate([q, p]), np.concatenate([T_pq, T_qp])
@@ -793,6 +832,7 @@ def accumulate(motions):
     return np.stack([*itertools.accumulate(motions, np.matmul, initial=np.eye(4))])
 
 
+@torch.inference_mode()
 def predict(net, scans, p, q, device):
     """Records of scans (C,) and index arrays p, q (B,) -> T_pq (B,4,4), in one forward pass."""
     y_hat = net(make_batch(scans, p, q, net.config, device)).cpu().numpy()
@@ -801,40 +841,62 @@ def predict(net, scans, p, q, device):
     return net.decode(y_hat)
 
 
-def predict_refined(net, scans_p, scans_q, refine, device):
-    """Records of scans (n,), (n,) -> T_pq (n,4,4). Not in the paper.
-
-    Predict both directions of every pair and average them. Then align Q with the prediction and
-    predict the residual motion, `refine` times.
-    """
-    n = len(scans_p)
-    p, q = np.arange(n), np.arange(n) + n
-    T = np.tile(np.eye(4), (n, 1, 1))
-    for _ in range(1 + refine):
-        scans = np.concatenate([scans_p, move_scans(scans_q, T)])
-        both = predict(net, scans, np.r_[p, q], np.r_[q, p], device)
-        T_pq, T_qp = both[:n], both[n:]
-        half = from_vector(to_vector(invert(T_pq) @ invert(T_qp)) / 2)  # half-way to T_qp^-1
-        T = T_pq @ half @ T
+def mean_motion(motions):
+    """Motions (n,4,4) that differ little -> their mean (4,4), a rigid motion."""
+    motions = np.stack(motions)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_matrix(motions[:, :3, :3]).mean().as_matrix()
+    T[:3, 3] = motions[:, :3, 3].mean(0)
     return T
 
 
-@torch.inference_mode()
-def predict_motions(net, records, device="cpu", batch=16, refine=0):
-    """Records of consecutive scans (n,) -> T_{t,t+1} (n-1,4,4), Velodyne frame.
+def predict_refined(net, keyframe, scan, guess, device):
+    """Records of P and Q, n samplings of each (n,), and a guess of T_pq -> T_pq (4,4).
 
-    `refine`: 0 for the paper's plain prediction, otherwise see `predict_refined`. ValueError for a
-    negative one.
+    Each pass takes a new sampling of both scans, aligns Q with the estimate so far, and adds the
+    residual motion, predicted in both directions and averaged. The result is the mean of the n
+    estimates, since their errors come mostly from the choice of centroids. Not in the paper.
     """
-    check_number("refine", refine)
+    T, estimates, forth, back = guess, [], np.array([0, 1]), np.array([1, 0])
+    for p, q in zip(keyframe, scan):
+        aligned, = move_scans(q[None], T[None])
+        T_pq, T_qp = predict(net, np.stack([p, aligned]), forth, back, device)
+        T = mean_motion([T_pq, invert(T_qp)]) @ T
+        estimates.append(T)
+    return mean_motion(estimates)
+
+
+def several_samplings(scan, config, n):
+    """Sample a scan n times: (N,4) -> records (n,), see `scan_geometry`. Not in the paper.
+
+    Sampling k takes its centroids from every n-th point, starting with point k, so no two samplings
+    share one, unless there are too few points. The neighbours come from the whole scan. A second
+    thread groups one sampling while the next is drawn.
+    """
+    scan, broken = usable_scan(scan, config)
+    cloud = np.ascontiguousarray(scan[:, :3])
+    with ThreadPoolExecutor(1) as thread:
+        tree = thread.submit(build_tree, cloud)
+
+        def group(centroids):
+            return group_scan(scan, broken, centroids, tree.result(), config)
+
+        parts = min(n, len(cloud) // config.sa1.n_fps)
+        jobs = []
+        for k in range(n):
+            part = np.arange(k % parts, len(cloud), parts)
+            centroids = part[farthest_point_sampling(cloud[part], config.sa1.n_fps)]
+            jobs.append(thread.submit(group, centroids))
+        return np.stack([job.result() for job in jobs])
+
+
+def predict_motions(net, records, device="cpu", batch=16):
+    """Records of consecutive scans (n,) -> T_{t,t+1} (n-1,4,4), Velodyne frame."""
     motions = [np.empty((0, 4, 4))]
     for i in range(0, len(records) - 1, batch):
         scans = records[i:i + batch + 1]
-        if refine:
-            motions.append(predict_refined(net, scans[:-1], scans[1:], refine, device))
-        else:
-            p = np.arange(len(scans) - 1)
-            motions.append(predict(net, scans, p, p + 1, device))
+        p = np.arange(len(scans) - 1)
+        motions.append(predict(net, scans, p, p + 1, device))
     return np.concatenate(motions)
 
 
@@ -846,17 +908,24 @@ class Odometry:
     """Poses from a stream of scans: `Odometry().register(scan)`.
 
     weights: a weights file or the folder of a training run, None for the weights beside this file;
-    refine: 0 for the paper's plain prediction, otherwise see `predict_refined`. ValueError for an
-    invalid argument, ValueError or FileNotFoundError for weights that cannot be read.
+    refine: 0 for the paper's plain prediction, n to refine it in n passes, see `predict_refined`;
+    network: the class of the network. ValueError for an invalid argument, ValueError or
+    FileNotFoundError for weights that cannot be read.
     """
 
-    def __init__(self, weights: str | Path | None = None, device: str = "cpu", refine: int = 0):
+    def __init__(self, weights: str | Path | None = None, device: str = "cpu", refine: int = 0,
+                 network=D3DLO):
         check_device(device)
         check_number("refine", refine)
-        net, state = load_weights(weights)
+        net, self.facts = load_weights(weights, network)
         self.net, self.device, self.refine = for_device(net, device), device, refine
-        self.seen = state["seen"]  # range of the scan statistics in training
+        self.seen = self.facts["seen"]  # range of the scan statistics in training
+        self.restart()
+
+    def restart(self):
+        """Forget all scans. The next one defines the frame of the poses."""
         self.pose, self.last = np.eye(4), None
+        self.keyframe, self.keyframe_pose = None, np.eye(4)
 
     def register(self, scan: np.ndarray) -> np.ndarray:
         """Scan (N,4): x, y, z [m], intensity 0 to 1 -> its pose T_0t (4,4), Velodyne frame.
@@ -864,20 +933,40 @@ class Odometry:
         The first pose is the identity. Warns about broken points, and about scans unlike those in
         training. ValueError for a scan that cannot be used; the state is then unchanged.
         """
-        record = scan_geometry(scan, self.net.config)
-        if record["broken"]:
-            warnings.warn(f"dropped {record['broken']} {BROKEN}", stacklevel=2)
-        pose = self.pose
-        if self.last is not None:
-            pair = np.stack([self.last, record])
-            motion, = predict_motions(self.net, pair, self.device, refine=self.refine)
-            pose = pose @ motion
-        if self.seen and (shift := kitti.domain_shift(record["stats"], self.seen)):
+        records = several_samplings(scan, self.net.config, max(self.refine, 1))
+        if records[0]["broken"]:
+            warnings.warn(f"dropped {records[0]['broken']} {BROKEN}", stacklevel=2)
+        pose = self.register_records(records)
+        if self.seen and (shift := kitti.domain_shift(records[0]["stats"], self.seen)):
             warnings.warn(f"{UNLIKE}: {shift}", stacklevel=2)
             self.seen = None  # warn once
-        self.pose = pose
-        self.last = record
-        return self.pose.copy()
+        return pose
+
+    def register_records(self, records):
+        """Samplings of the next scan (max(refine, 1),), see `several_samplings` -> its pose (4,4).
+
+        Eq. 1 gives the pose from the motion since the last scan. With `refine`, the pose is then
+        refined against a keyframe, an earlier scan that is replaced from time to time: the error of
+        a registration adds up once a keyframe, not once a scan.
+        """
+        pose = self.pose
+        if self.last is not None:
+            motion, = predict_motions(self.net, np.stack([self.last, records[0]]), self.device)
+            pose = pose @ motion
+        if self.keyframe is not None:
+            guess = invert(self.keyframe_pose) @ pose
+            T = predict_refined(self.net, self.keyframe, records, guess, self.device)
+            pose = self.keyframe_pose @ T
+        if self.refine and (self.keyframe is None or is_far(invert(self.keyframe_pose) @ pose)):
+            self.keyframe, self.keyframe_pose = records, pose
+        self.pose, self.last = pose, records[0]
+        return pose.copy()
+
+
+def is_far(T):
+    """Whether a motion (4,4) asks for a new keyframe."""
+    angle = np.degrees(Rotation.from_matrix(T[:3, :3]).magnitude())
+    return np.linalg.norm(T[:3, 3]) >= KEYFRAME_DISTANCE or angle >= KEYFRAME_ANGLE
 
 
 def relative_pose(scan_p: np.ndarray, scan_q: np.ndarray, weights: str | Path | None = None,
@@ -925,20 +1014,34 @@ def warn_about_shift(s, records, seen):
               file=sys.stderr)
 
 
-def evaluate_sequence(net, state, s, records, out, device="cpu", refine=0):
+def predict_poses(odometry, s, records):
+    """Poses T_0t (n,4,4) of all scans of a sequence, whose records (n,) are known."""
+    warn_about_shift(s, records, odometry.facts["seen"])
+    if not odometry.refine:  # many pairs at a time are faster than one by one
+        return accumulate(predict_motions(odometry.net, records, odometry.device))
+    odometry.restart()
+    poses = []
+    for i in progress(range(len(s)), len(s), f"registering {s.name}, scans"):
+        try:
+            samplings = several_samplings(s.scan(i), odometry.net.config, odometry.refine)
+            poses.append(odometry.register_records(samplings))
+        except ValueError as error:
+            raise ValueError(f"{s.scan_paths[i]}: {error}") from None
+    return np.stack(poses)
+
+
+def evaluate_sequence(odometry, s, records, out):
     """Predict the trajectory of a sequence and write OUT/NN.txt, a KITTI pose file.
 
     Returns {predictor: (segment errors, step errors)} for the network and the BASELINES, which is
     empty without ground truth.
     """
-    warn_about_shift(s, records, state["seen"])
-    motions = predict_motions(net, records, device, refine=refine)
-    poses = accumulate(motions)
+    poses = predict_poses(odometry, s, records)
     metrics.write_poses(out / f"{s.name}.txt", kitti.velo_to_camera(poses, s.Tr))
     if s.poses is None:
         return {}
-    still = np.broadcast_to(np.eye(4), motions.shape)
-    mean = np.broadcast_to(from_vector(state["mean_motion"]), motions.shape)
+    still = np.tile(np.eye(4), (len(s) - 1, 1, 1))
+    mean = np.tile(from_vector(odometry.facts["mean_motion"]), (len(s) - 1, 1, 1))
     errors = {}
     for predictor, T in zip(("network", *BASELINES), (poses, accumulate(still), accumulate(mean))):
         segments = metrics.segment_errors(s.poses_cam, kitti.velo_to_camera(T, s.Tr))
@@ -946,28 +1049,25 @@ def evaluate_sequence(net, state, s, records, out, device="cpu", refine=0):
     return errors
 
 
-def evaluate_sequences(net, state, sequences, out, device, refine):
+def evaluate_sequences(odometry, sequences, out):
     """Predict the trajectories of sequences and write OUT/NN.txt. Returns what `summarize` does."""
-    geometry, fingerprints = load_geometry(sequences, net.config)
-    net = for_device(net, device)
+    geometry, fingerprints = load_geometry(sequences, odometry.net.config)
     clear_results(out)
     work = progress(zip(sequences, geometry), len(sequences), "registering, sequences")
-    errors = {s.name: evaluate_sequence(net, state, s, records, out, device, refine)
-              for s, records in work}
+    errors = {s.name: evaluate_sequence(odometry, s, records, out) for s, records in work}
     # Sequences are compared by content, since different data may have the same name
-    known = {*state["train"].values(), *state["before"]}
+    known = {*odometry.facts["train"].values(), *odometry.facts["before"]}
     return summarize(errors, {s.name: f in known for s, f in zip(sequences, fingerprints)})
 
 
-def evaluate_folder(net, state, s, out, device="cpu", refine=0, plot=False, say=print):
+def evaluate_folder(odometry, s, out, plot=False, say=print):
     """Predict the trajectory of a `kitti.ScanFolder`, with poses in the LiDAR's frame.
 
     Writes OUT/poses.txt, OUT/poses.tum and OUT/results.json. Returns the folder OUT.
     """
     began = time.monotonic()
-    (records,), _ = load_geometry([s], net.config)
-    warn_about_shift(s, records, state["seen"])
-    poses = accumulate(predict_motions(for_device(net, device), records, device, refine=refine))
+    (records,), _ = load_geometry([s], odometry.net.config)
+    poses = predict_poses(odometry, s, records)
     rate = len(s) / (time.monotonic() - began)
     clear_results(out)
     metrics.write_poses(out / "poses.txt", poses)
@@ -982,7 +1082,7 @@ def evaluate_folder(net, state, s, out, device="cpu", refine=0, plot=False, say=
         metrics.draw(out / "plot.png", {s.name: (None, poses)})
         files.append("plot.png")
         lines.append(f"picture       {out}/plot.png (from above)")
-    source = {"data": str(s.folder), "refine": refine, "files": files}
+    source = {"data": str(s.folder), "refine": odometry.refine, "files": files}
     metrics.write_json(out / "results.json", source | {"path_m": length, "scans": len(s)})
     say("\n".join(lines))
     return out
@@ -1033,7 +1133,7 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     sequences: a list of names or splits. None: all, or the simulated test and validation splits.
     out: the folder to write to. None: a new one, results/TIME.
     device: cpu, cuda or mps.
-    refine: number of refinements, see `predict_refined`.
+    refine: number of refinement passes, see `predict_refined`.
     plot: also draw OUT/plot.png.
     say: called with the text to print.
     network: the class of the network.
@@ -1041,9 +1141,7 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     Returns the folder `out`. Raises ValueError if an argument, the weights or the data are
     invalid, and OSError if a file cannot be read or written.
     """
-    check_device(device)
-    check_number("refine", refine)
-    net, state = load_weights(weights, network)
+    odometry = Odometry(weights, device, refine, network)
     if plot:
         metrics.picture(1, 1)  # without matplotlib, fail now and not after the work
     sequences = sequences or ("all" if data else ("test", "validation"))
@@ -1052,9 +1150,9 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     check_output(out, root)
     chosen = kitti.open_sequences(root, sequences)
     if isinstance(chosen[0], kitti.ScanFolder):
-        return evaluate_folder(net, state, chosen[0], out, device, refine, plot, say)
+        return evaluate_folder(odometry, chosen[0], out, plot, say)
 
-    results = evaluate_sequences(net, state, chosen, out, device, refine)
+    results = evaluate_sequences(odometry, chosen, out)
     files = [f"{s.name}.txt" for s in chosen]
     lines = [f"trajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)",
              f"figures       {out}/results.json"]
@@ -1158,12 +1256,9 @@ def farthest_point_sampling(xyz: np.ndarray, n: int, start: int = 0) -> np.ndarr
     return centroids
 
 
-def sample_and_index(xyz, n):
-    """`farthest_point_sampling`, and a cKDTree built at the same time in a second thread."""
-    with ThreadPoolExecutor(1) as thread:
-        # These options make the tree faster to build and do not slow its queries down.
-        tree = thread.submit(cKDTree, xyz, leafsize=48, balanced_tree=False, compact_nodes=False)
-        return farthest_point_sampling(xyz, n), tree.result()
+def build_tree(xyz):
+    """cKDTree(xyz), with options that make it faster to build and its queries no slower."""
+    return cKDTree(xyz, leafsize=48, balanced_tree=False, compact_nodes=False)
 
 
 def fast(net):

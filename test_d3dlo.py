@@ -633,7 +633,8 @@ def test_augmented_pairs_still_fit_their_motion(seed):
     for p, q in geometry:  # Q is P moved: the same points in the same order
         assert_array_equal(p["idx_sa2"], q["idx_sa2"])
     before, T = np.stack([g[d] for d in (0, 1) for g in geometry]), np.concatenate(motions)
-    scans, T_new = d3dlo.augment(before, T, rng)
+    aligned = np.array([True, False] * 3)
+    scans, T_new = d3dlo.augment(before, T, aligned, rng)
     for p, q, old, X, Y in zip(scans[:6], scans[6:], before[:6], T_new, T):
         assert_allclose(transform(X, q["xyz"]), p["xyz"], atol=1e-4)
         near_p, near_q = (c["xyz"][:, None] + c["group_sa1"][..., 1:] for c in (p, q))
@@ -647,24 +648,67 @@ def test_augmented_pairs_still_fit_their_motion(seed):
     assert before.tobytes() == scans.tobytes()
 
 
-def test_augmentation_mirrors_half_of_the_pairs_and_aligns_a_quarter():
+def test_augmentation_mirrors_half_of_the_pairs_and_aligns_those_asked_for():
     n, rng = 2000, generator(0)
     far = euler_pose(np.array([100, 40, 0, 0, 0, 90.0]))  # larger than any residual motion
     scans = np.zeros(2 * n, d3dlo.geometry_dtype(replace(SMALL, sa1=SMALL.sa1._replace(n_fps=16))))
     scans["xyz"][:] = 1
-    moved, T = d3dlo.augment(scans, np.tile(far, (n, 1, 1)), rng)
+    aligned = rng.random(n) < 0.3
+    moved, T = d3dlo.augment(scans, np.tile(far, (n, 1, 1)), aligned, rng)
     p = moved["xyz"][:n, 0]
     assert_array_equal(np.unique(p, axis=0), [[1, -1, 1], [1, 1, 1]])  # half of them, left to right
     mirrored = p[:, 1] < 0
     assert abs(mirrored.mean() - 0.5) < 0.05
-    aligned = np.linalg.norm(T[:, :3, 3], axis=1) < 3
-    assert abs(aligned.mean() - 0.25) < 0.05
     mirror = np.diag([1, -1, 1, 1])
-    for chosen, base in ((aligned, np.eye(4)), (~aligned & mirrored, mirror @ far @ mirror),
-                         (~aligned & ~mirrored, far)):
+    for chosen, base, size in ((aligned, np.eye(4), np.sqrt(1 / 3)),
+                               (~aligned & mirrored, mirror @ far @ mirror, 1),
+                               (~aligned & ~mirrored, far, 1)):
         A = to_vector(invert(T[chosen]) @ base)  # Q moves after it has been aligned
         assert_allclose(A.mean(0), 0, atol=0.15)
-        assert_allclose(A.std(0), [0.25, 0.1, 0.03, 0.1, 0.1, 1.0], rtol=0.15)
+        assert_allclose(A.std(0), np.multiply([0.25, 0.1, 0.03, 0.1, 0.1, 1.0], size), rtol=0.15)
+
+
+@given(SEED)
+def test_a_later_scan_is_the_next_one_or_within_the_distance_of_keyframes(seed):
+    rng = generator(seed)
+    motions = random_motion(rng, n=12) * 1.0
+    motions[:, :3, 3] *= rng.choice([0, 1, 4], (12, 1))  # [m]; some stand still, some are far
+    i, drawn = int(rng.integers(12)), set()
+    for _ in range(200):
+        drawn.add(d3dlo.later_scan(motions, i, rng))
+    metres, within = 0.0, {i + 1}
+    for j in range(i, 12):
+        metres += np.linalg.norm(motions[j, :3, 3])
+        if metres < d3dlo.KEYFRAME_DISTANCE:
+            within.add(j + 1)
+    # A scan is left out where the next one is at the same place
+    still = {j for j in within if j < 12 and not motions[j, :3, 3].any() and j + 1 in within}
+    assert drawn <= within and len(within - still) >= len(drawn - still)
+
+
+def test_a_share_of_augmented_pairs_are_several_scans_apart_and_aligned():
+    """Scans of a static world, each with its number for an intensity, which nothing changes."""
+    rng = generator(0)
+    motions = random_motion(rng, n=30)
+    motions[:, :3, 3] *= 1.2 / np.linalg.norm(motions[:, :3, 3], axis=1)[:, None]  # as on a road
+    world, poses = random_scan(rng, 60), d3dlo.accumulate(motions)
+    first = scan_geometry(world, SMALL)
+    records = d3dlo.move_scans(np.stack([first] * 31), invert(poses))
+    records["group_sa1"][..., 0] = np.arange(31)[:, None, None]
+    config = replace(SMALL, swap="both", augment=True)
+    pairs, gaps, residuals = [(0, i) for i in range(26)], [], []
+    for _ in range(40):
+        batch, T = d3dlo.training_batch([records], [motions], pairs, config, rng)
+        numbers = batch.group_sa1[:, 0, 0, 0].numpy()
+        for p, q, T_pq in zip(batch.p[:26], batch.q[:26], T):
+            assert_allclose(transform(T_pq, batch.xyz[q].numpy()), batch.xyz[p], atol=1e-3)
+            gaps.append(numbers[q] - numbers[p])
+            residuals.append(np.linalg.norm(T_pq[:3, 3]))
+    gaps, residuals = np.array(gaps), np.array(residuals)
+    assert set(gaps) == {1, 2, 3, 4}  # 4.8 m at most
+    assert abs((gaps > 1).mean() - d3dlo.ALIGNED * (5 - 2.4) / 5) < 0.05
+    assert np.all(residuals[gaps > 1] < 1.2)  # aligned up to a small motion
+    assert (residuals > 0.6).mean() > 0.5  # most others are not
 
 
 def fit(folder, config, resume=None, test=None, say=None):
@@ -1501,11 +1545,13 @@ def new_drive(tmp_path_factory):
 
 
 def test_the_pretrained_weights_are_accurate_on_an_unseen_sequence(new_drive):
-    (s, records), (net, _) = new_drive, load_weights()
-    poses = d3dlo.accumulate(d3dlo.predict_motions(net, records, refine=1))
+    s, _ = new_drive
     moved = np.linalg.norm(s.motions()[:, :3, 3], axis=1)
-    t, r = metrics.step_errors(s.poses, poses).mean(0)
-    assert count(net) == 61290 and moved.mean() > 0.5 and t < 0.15 and r < 0.2
+    for refine in (0, 2):
+        odometry = d3dlo.Odometry(refine=refine)
+        poses = np.stack([odometry.register(s.scan(i)) for i in range(len(s))])
+        t, r = metrics.step_errors(s.poses, poses).mean(0)
+        assert count(odometry.net) == 61290 and moved.mean() > 0.5 and t < 0.15 and r < 0.2
 
 
 @torch.inference_mode()
@@ -1542,8 +1588,22 @@ def test_odometry_multiplies_relative_poses_and_a_refused_scan_changes_nothing(t
     assert_allclose(d3dlo.accumulate(together)[-1], expected, atol=1e-3)
 
 
-@given(SEED)
-def test_refining_averages_both_directions_then_predicts_the_residual_motion(seed):
+@given(SEED, st.integers(1, 5), st.integers(48, 200))
+def test_samplings_share_no_centroid_and_are_grouped_in_the_whole_scan(seed, n, points):
+    scan = random_scan(generator(seed), points)
+    records = d3dlo.several_samplings(scan, SMALL, n)
+    parts = min(n, points // SMALL.sa1.n_fps)  # fewer parts where there are too few points
+    tree = cKDTree(scan[:, :3])
+    for k, record in enumerate(records):
+        part = np.arange(points)[k % parts::parts]
+        centroids = part[fps_textbook(scan[part, :3], SMALL.sa1.n_fps)]
+        assert_array_equal(record, d3dlo.group_scan(scan, 0, centroids, tree, SMALL))
+    assert len(records) == n
+    assert n > 1 or records.tobytes() == scan_geometry(scan, SMALL).tobytes()
+
+
+@given(SEED, st.integers(1, 4))
+def test_refining_averages_directions_and_samplings(seed, n):
     def one_way(p, q):
         """Replace the network by a small, smooth motion that differs in the two directions."""
         return from_vector((p["xyz"][:2] - 0.7 * q["xyz"][1:3]).ravel() / 10)
@@ -1551,24 +1611,77 @@ def test_refining_averages_both_directions_then_predicts_the_residual_motion(see
     def predict_one_way(net, scans, p, q, device):
         return np.stack([one_way(*scans[[i, j]]) for i, j in zip(p, q)])
 
-    def both_ways(p, q):
-        forward, backward = one_way(p, q), invert(one_way(q, p))
-        T = (forward + backward) / 2
-        T[:3, :3] = Rotation.from_matrix([forward[:3, :3], backward[:3, :3]]).mean().as_matrix()
+    def mean(motions):
+        T = np.mean(motions, 0)
+        T[:3, :3] = Rotation.from_matrix([T[:3, :3] for T in motions]).mean().as_matrix()
         return T
 
     rng = generator(seed)
-    records = np.stack([scan_geometry(random_scan(rng, 48), SMALL) for _ in range(4)])
+    p, q = (d3dlo.several_samplings(random_scan(rng, 48), SMALL, n) for _ in range(2))
+    guess = random_motion(rng, 0.1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(d3dlo, "predict", predict_one_way)
-        motions = d3dlo.predict_motions(None, records, batch=2, refine=2)
-    for T, p, q in zip(motions, records[:-1], records[1:], strict=True):
-        expected = both_ways(p, q)
-        for _ in range(2):
-            # move_scans is tested with the augmentation
-            aligned = d3dlo.move_scans(q[None], expected[None])[0]
-            expected = both_ways(p, aligned) @ expected
-        assert_allclose(T, expected, atol=1e-3)
+        got = d3dlo.predict_refined(None, p, q, guess, "cpu")
+    T, estimates = guess, []
+    for p_k, q_k in zip(p, q, strict=True):
+        aligned, = d3dlo.move_scans(q_k[None], T[None])  # tested with the augmentation
+        T = mean([one_way(p_k, aligned), invert(one_way(aligned, p_k))]) @ T
+        estimates.append(T)
+    assert_allclose(got, mean(estimates), atol=2e-3)
+
+
+@given(SEED)
+def test_refined_odometry_registers_against_keyframes(tmp_path, seed):
+    """With plain predictions off by some decimetres and exact refined ones, all poses are exact."""
+    rng = generator(seed)
+    motions = random_motion(rng, n=20) @ from_vector([1.0, 0, 0, 0, 0, 4])
+    truth, calls = d3dlo.accumulate(motions), []
+
+    def number(records):
+        return int(np.ravel(records["broken"])[0])
+
+    def plain(net, pair, device):
+        p, q = (number(record) for record in pair)
+        assert q == p + 1
+        return [motions[p] @ from_vector([0.3, 0.1, 0, 0, 0, 1])]
+
+    def refined(net, keyframe, scan, guess, device):
+        p, q = number(keyframe), number(scan)
+        calls.append((p, q, len(keyframe), len(scan)))
+        T_pq = invert(truth[p]) @ truth[q]
+        assert_allclose(invert(T_pq) @ guess, from_vector([0.3, 0.1, 0, 0, 0, 1]), atol=1e-6)
+        return T_pq
+
+    save_weights(tmp_path / "w.pt", SMALL)
+    odometry = d3dlo.Odometry(tmp_path / "w.pt", refine=3)
+    expected, keyframe = [], 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(d3dlo, "predict_motions", plain)
+        patch.setattr(d3dlo, "predict_refined", refined)
+        for i in range(21):
+            records = np.zeros(3, d3dlo.geometry_dtype(SMALL))
+            records["broken"] = i
+            assert_allclose(odometry.register_records(records), truth[i], atol=1e-6)
+            if i:
+                expected.append((keyframe, i, 3, 3))
+                T = invert(truth[keyframe]) @ truth[i]
+                angle = np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))
+                if np.linalg.norm(T[:3, 3]) >= 5 or angle >= 20:
+                    keyframe = i
+    assert calls == expected and keyframe > 0
+
+
+def test_refined_poses_stay_rigid_in_a_long_drive(tmp_path):
+    """Inverting by transposition must not let rounding errors grow from scan to scan."""
+    rng = generator(0)
+    save_weights(tmp_path / "w.pt", SMALL)
+    odometry = d3dlo.Odometry(tmp_path / "w.pt", refine=1)
+    records = np.zeros(1, d3dlo.geometry_dtype(SMALL))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(d3dlo, "predict", lambda net, scans, p, *_: random_motion(rng, n=len(p)))
+        for _ in range(300):
+            pose = odometry.register_records(records)
+    assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
 
 
 @pytest.mark.parametrize("refine", [-1, 1.5, "1", None, float("nan")])
@@ -1950,13 +2063,13 @@ def test_eval_into_the_same_folder_deletes_the_earlier_results_and_nothing_else(
 
 def test_eval_refines_as_often_as_asked(cwd):
     s, = kitti.open_sequences(write_root(cwd / "root", size=60))
-    net = save_weights("w.pt", SMALL)
-    records = np.stack([scan_geometry(s.scan(i), SMALL) for i in range(6)])
+    save_weights("w.pt", SMALL)
     assert d3dlo.main("eval --data root --weights w.pt --refine 2 --out out".split()) == 0
     got = kitti.camera_to_velo(metrics.read_poses("out/00.txt"), s.Tr)
-    plain, twice = (d3dlo.accumulate(d3dlo.predict_motions(net, records, refine=n)) for n in (0, 2))
-    assert_allclose(got, twice, atol=1e-3)
-    assert np.abs(got - plain).max() > 0.1
+    for refine, same in ((0, False), (1, False), (2, True), (3, False)):
+        odometry = d3dlo.Odometry("w.pt", refine=refine)
+        poses = [odometry.register(s.scan(i)) for i in range(6)]
+        assert np.allclose(got, poses, atol=1e-3) == same
 
 
 def test_the_baselines_stand_still_or_repeat_the_mean_motion_of_training(cwd, capsys):
