@@ -6,8 +6,10 @@ intensity [0..1]. `T_ab` maps points from frame b to frame a.
 KITTI's pose files are in the frame of the rectified left camera. The points are in the Velodyne
 frame, so `poses` and `motions()` of a sequence are, too: T_velo = inv(Tr) @ T_cam @ Tr.
 
-The simulated city can be used in place of KITTI. An HDL-64E drives through 11 small cities, with
-exact ground truth: 2,620 scans, 4.2 GB. Needs NumPy and SciPy.
+The simulated city can be used in place of KITTI. An HDL-64E drives through 11 small cities, in
+traffic that moves with it, towards it and across its way, on streets with queues at lights, on
+roundabouts, ramps and motorways. The ground truth is exact: 2,620 scans, 4.2 GB. Needs NumPy and
+SciPy.
 
     python kitti.py simulate data/city
     python kitti.py simulate data/tiny --sequences 00 07 --scans 40 --azimuth 900
@@ -1022,11 +1024,12 @@ ALBEDO = 7
 FUZZ = 8  # depth to which foliage lets light in; 0 for a solid
 ROUND = 9  # 1 for a cylinder, 0 for a box
 
-CITY = 3  # version; increase it when the city changes, so that scans of two are never mixed
+CITY = 4  # version; increase it when the city changes, so that scans of two are never mixed
 # Elevation of the 64 beams of an HDL-64E, from the lowest to the highest
 ELEVATION = np.radians(np.r_[np.linspace(-24.33, -8.83, 32), np.linspace(-8.33, 2.0, 32)])
 SENSOR_HEIGHT, MIN_RANGE, CITY_RANGE = 1.73, 2.5, 80.0
-LANE = 3.5  # width; the road has two lanes, and we drive in the middle of the right one
+LANE = 3.5  # width of a lane
+SIDE_STREET = 70.0  # how far a side street goes on both sides of the road
 CELL = 0.5  # size of a cell of the ground
 RELIEF = 0.4  # depth of windows and doors, in prisms higher than 3 m
 DENSE, SUBURBAN, OPEN = 0, 1, 2  # surroundings
@@ -1036,34 +1039,43 @@ class _Style(NamedTuple):
     """How a sequence drives, and through which surroundings."""
 
     cruise: float  # cruising speed [m/s]
-    corners: float  # probability of a street corner every 35 to 80 m; farther apart above 15 m/s
-    stops: int  # number of times it comes to a halt
+    halts: int  # number of halts every 150 scans, in a queue at a light
+    lanes: int  # number of lanes in each direction
+    reservation: float  # width of the central reservation; only motorways have one
+    # Odds of no junction, a street corner, a ramp and a roundabout every 35 to 80 m; these are
+    # farther apart above 15 m/s
+    junctions: tuple
     odds: tuple  # of dense, suburban and open surroundings
 
 
 STYLES = {
-    "00": _Style(12, 0.55, 0, (6, 3, 1)),
-    "01": _Style(26, 0.15, 0, (1, 3, 12)),
-    "02": _Style(15, 0.4, 0, (1, 6, 2)),
-    "03": _Style(10, 0.5, 0, (2, 5, 2)),
-    "04": _Style(18.5, 0.2, 0, (3, 3, 3)),
-    "05": _Style(12, 0.55, 1, (6, 3, 1)),
-    "06": _Style(16, 0.4, 0, (3, 5, 1)),
-    "07": _Style(12, 0.5, 1, (6, 3, 1)),
-    "08": _Style(12, 0.5, 1, (4, 4, 1)),
-    "09": _Style(19, 0.3, 0, (1, 3, 5)),
-    "10": _Style(13, 0.5, 1, (2, 4, 3)),
+    "00": _Style(13, 1, 1, 0, (5, 5, 0, 1), (6, 3, 1)),
+    "01": _Style(28, 0, 3, 3, (3, 0, 1, 0), (1, 6, 8)),
+    "02": _Style(15, 0, 1, 0, (6, 2, 1, 1), (2, 6, 1)),
+    "03": _Style(11, 0, 1, 0, (5, 3, 0, 2), (2, 5, 2)),
+    "04": _Style(28, 0, 2, 3, (3, 0, 1, 0), (2, 5, 2)),
+    "05": _Style(13, 1, 2, 0, (5, 5, 0, 1), (6, 3, 1)),
+    "06": _Style(16, 0, 2, 0, (4, 1, 1, 1), (3, 5, 1)),
+    "07": _Style(13, 1, 1, 0, (5, 4, 1, 1), (6, 3, 1)),
+    "08": _Style(14, 1, 2, 0, (5, 4, 1, 1), (4, 4, 1)),
+    "09": _Style(22, 0, 2, 2, (4, 0, 2, 1), (1, 5, 3)),
+    "10": _Style(14, 1, 1, 0, (5, 2, 2, 2), (2, 4, 3)),
 }
 
 # The drive
 
 
-def _drive(rng, scans, style):
-    """Draw a road and a drive along it.
+class _Drive(NamedTuple):
+    """A road and a drive along it."""
 
-    Returns position(s, left=0) -> x, y, heading at s metres along the road and `left` metres to its
-    left; distance(t) -> metres driven after t seconds; and the length of the road.
-    """
+    position: Callable  # s, left=0 -> x, y, heading at s metres along the road, `left` to its left
+    distance: Callable  # seconds -> metres along the road
+    length: float  # of the road
+    halts: np.ndarray  # where we stand [m]
+
+
+def _drive(rng, scans, style):
+    """Draw a `_Drive`."""
     ds = 0.25  # step along the road
     start = 100.0  # the drive starts here, so there is road behind it as well
     length = 100 + 0.13 * style.cruise * scans + 150
@@ -1083,22 +1095,27 @@ def _drive(rng, scans, style):
     s = np.arange(len(k)) * ds
 
     # Speed: limited by the piece of road, the lateral acceleration in bends, and halts
-    lateral = rng.uniform(2.8, 3.6)  # [m/s2]
+    lateral = rng.uniform(3.4, 4.6)  # [m/s2]
     v = np.minimum(speed, np.sqrt(lateral / np.maximum(np.abs(k), 1e-4)))
-    halts = start + 0.07 * style.cruise * scans * rng.uniform(0.2, 1, style.stops)
+    # The first halt is at the start, the others are up to 0.7 of the way
+    n = int(style.halts * scans / 150)
+    halts = start + 0.07 * style.cruise * scans * np.sort(rng.random(n)) * (np.arange(n) > 0)
     for halt in halts:
-        v[abs(s - halt) < 1] = 0.4
-    # Limit acceleration (forward pass) and braking (backward pass) to 2.2 m/s2
-    gain = 2 * 2.2 * ds  # largest change of v^2 in a step
+        v[abs(s - halt) < 0.5] = 0.5
+    # Limit acceleration (forward pass) and braking (backward pass) to 2.5 m/s2
+    gain = 2 * 2.5 * ds  # largest change of v^2 in a step
     for i in range(1, len(v)):
         v[i] = min(v[i], np.sqrt(v[i - 1]**2 + gain))
     for i in range(len(v) - 2, -1, -1):
         v[i] = min(v[i], np.sqrt(v[i + 1]**2 + gain))
 
     t = np.r_[0, np.cumsum(ds / smooth(v, 1.0))[:-1]]
-    for halt in halts:
-        t[s > halt] += rng.uniform(0.5, 2.0)  # standing still
-    t -= np.interp(start, s, t)
+    driven = s
+    for halt in halts:  # stand still: two times for the same place
+        i = np.searchsorted(driven, halt)
+        t = np.r_[t[:i + 1], t[i:] + rng.uniform(1, 4)]
+        driven = np.insert(driven, i, driven[i])
+    t -= t[np.searchsorted(driven, start)]
     heading = np.cumsum(k) * ds
     x = np.cumsum(np.cos(heading)) * ds
     y = np.cumsum(np.sin(heading)) * ds
@@ -1110,32 +1127,38 @@ def _drive(rng, scans, style):
         return x_left, y_left, angle
 
     def distance(at):
-        return np.interp(at, t, s)
+        return np.interp(at, t, driven)
 
-    return position, distance, s[-1]
+    return _Drive(position, distance, s[-1], halts)
 
 
 def _pieces_of_road(rng, style):
-    """Draw a straight piece, a bend and perhaps a street corner: (length, curvature, speed) each.
+    """Draw a straight piece, a bend, which may be straight too, and a junction.
 
-    The bend may be straight, too. A corner that is not there has the length 0.
+    Returns pieces (length, curvature, speed).
     """
     stretch = rng.uniform(35, 80) * max(style.cruise / 15, 1) ** 2
-    speed = style.cruise * rng.uniform(0.75, 1.0)
+    speed = style.cruise * rng.uniform(0.8, 1.0)
     side = rng.choice([-1, 1])
     lateral = rng.choice([0.0, rng.uniform(1.0, 2.8)])  # acceleration in the bend [m/s2]
     bend = side * lateral / speed**2  # [1/m]
     # A bend turns by 60 degrees at most
     arc = min(rng.uniform(0.5, 0.8) * stretch, np.radians(60) / max(abs(bend), 1e-6))
-    radius = rng.choice([-1, 1]) * rng.uniform(7, 12)
-    angle = np.radians(rng.uniform(70, 100))
-    if rng.random() >= style.corners:
-        angle = 0.0
-    return [(stretch - arc, 0.0, speed), (arc, bend, speed),
-            (abs(radius) * angle, 1 / radius, speed)]
+
+    # Turns of the junction: radius [m], and angle [degrees], positive to the left
+    kind = rng.choice(4, p=np.array(style.junctions) / sum(style.junctions))
+    corner = rng.uniform(7, 12) + LANE * (style.lanes - 1), side * rng.uniform(70, 100)
+    ramp = rng.uniform(25, 32), side * rng.uniform(60, 150)
+    # Enter a roundabout to the right, drive a quarter or a half of it, leave it to the right
+    radius = rng.uniform(19, 25)
+    roundabout = [(radius, -45), (radius, rng.choice([90, 180])), (radius, -45)]
+    turns = ([], [corner], [ramp], roundabout)[kind]
+    return [(stretch - arc, 0.0, speed), (arc, bend, speed)] + [
+        (radius * np.radians(abs(angle)), np.sign(angle) / radius, speed)
+        for radius, angle in turns]
 
 
-def _sensor_poses(rng, position, distance, scans):
+def _sensor_poses(rng, drive, scans):
     """Poses T_wt (scans,4,4) of the Velodyne on the flat world.
 
     The car follows the road. It leans in bends, pitches when it brakes, and shakes.
@@ -1151,11 +1174,12 @@ def _sensor_poses(rng, position, distance, scans):
         return total
 
     # Speed and acceleration from the distances 0.2 s before, now and 0.2 s after
-    before, s, after = (distance(t + dt) for dt in (-0.2, 0, 0.2))
+    before, s, after = (drive.distance(t + dt) for dt in (-0.2, 0, 0.2))
     speed = (after - before) / 0.4  # [m/s]
     acceleration = (after - 2 * s + before) / 0.04  # [m/s2]
-    x, y, yaw = position(s)
-    lateral = speed * (position(after)[2] - position(before)[2]) / 0.4  # acceleration [m/s2]
+    x, y, yaw = drive.position(s)
+    turn = drive.position(after)[2] - drive.position(before)[2]
+    lateral = speed * turn / 0.4  # acceleration [m/s2]
 
     shake = np.minimum(speed / 8, 1)  # a car at rest does not shake
     shake_roll = shake * (wave(0.25, 0.2, 0.8) + wave(0.12, 1, 2.5))
@@ -1208,196 +1232,284 @@ def _prisms(*columns):
     return np.stack(np.broadcast_arrays(*arrays), axis=-1).reshape(-1, 10)
 
 
-def _cars(x, y, yaw, looks):
-    """Positions, headings and `_car_looks` of n cars -> prisms (2n,10).
-
-    A car is a body with a gap below it, and a cabin whose windows return little light.
-    """
-    length, height, albedo = looks
-    waist = np.where(height > 1.9, 0.5 * height, 0.9)
-    body = _prisms(x, y, yaw, length / 2, 0.88, 0.25, waist, albedo, 0, 0)
-    back = 0.08 * length  # the cabin is behind the middle of the body
-    x, y = x - back * np.cos(yaw), y - back * np.sin(yaw)
-    cabin = _prisms(x, y, yaw, 0.29 * length, 0.78, waist, height, 0.6 * albedo, 0, 0)
-    return np.concatenate([body, cabin])
+# Car, van, lorry and bus: length and height, both from and to; half of the width; waist, which is
+# the height of the lower part; length of the upper part and how far it is moved back, in lengths of
+# the vehicle; its albedo compared with the lower part's, low where there are windows
+VEHICLES = np.array([
+    (3.6, 4.8, 1.4, 1.6, 0.88, 0.9, 0.58, 0.08, 0.6),
+    (5.0, 6.5, 2.0, 2.8, 0.95, 1.1, 0.80, 0.10, 0.8),
+    (7.0, 15.0, 3.2, 4.0, 1.25, 2.6, 0.75, 0.12, 1.2),
+    (10.0, 13.0, 2.9, 3.3, 1.25, 1.2, 1.00, 0.00, 0.7),
+])
+PARKED, MOVING = (0.88, 0.12, 0, 0), (0.76, 0.12, 0.08, 0.04)  # shares of these four
 
 
-def _car_looks(rng, n=None):
-    """Draw length, height and albedo of n cars (3,n). One in eight is a van; many are dark."""
-    van = rng.random(n) < 0.12
-    van_length, car_length = rng.uniform(5, 6.5, n), rng.uniform(3.6, 4.8, n)
-    van_height, car_height = rng.uniform(2, 2.8, n), rng.uniform(1.4, 1.6, n)
-    albedo = 0.02 + 0.5 * rng.random(n) ** 2
-    return np.stack([np.where(van, van_length, car_length), np.where(van, van_height, car_height),
-                     albedo])
+def _vehicles(rng, n, shares):
+    """Draw n vehicles at the origin, heading along x -> prisms (2,n,10): lower and upper parts."""
+    kind = VEHICLES[rng.choice(len(VEHICLES), n, p=shares)].T
+    length, height = rng.uniform(kind[0], kind[1]), rng.uniform(kind[2], kind[3])
+    half_width, waist, share, back, dim = kind[4:]
+    albedo = 0.02 + 0.5 * rng.random(n) ** 2  # many are dark
+    lower = _prisms(0, 0, 0, length / 2, half_width, 0.25, waist, albedo, 0, 0)
+    upper = _prisms(-back * length, 0, 0, share * length / 2, half_width - 0.1, waist, height,
+                    dim * albedo, 0, 0)
+    return np.stack([lower, upper])
+
+
+def _place(vehicles, x, y, yaw):
+    """Move vehicles (2,n,10) from the origin to places (n,) -> prisms (2n,10)."""
+    placed = vehicles.copy()
+    placed[..., X] = x + vehicles[..., X] * np.cos(yaw)
+    placed[..., Y] = y + vehicles[..., X] * np.sin(yaw)
+    placed[..., YAW] = yaw
+    return placed.reshape(-1, 10)
 
 
 class _Street:
-    """One side of a road of `length` metres: its prisms are collected in the list `out`.
+    """One side of a road: its prisms are collected in the list `prisms`.
 
     side: 1 for the left side, -1 for the right; edge: distance from our path to the edge of the
     road; zones: the surroundings of every 70 m. Random numbers are drawn in a fixed order, since
     the same seed must always give the same city.
     """
 
-    def __init__(self, rng, position, length, side, edge, zones):
-        self.rng, self.position, self.length = rng, position, length
+    def __init__(self, rng, drive, side, edge, zones):
+        self.rng, self.position, self.length = rng, drive.position, drive.length
         self.side, self.edge, self.zones = side, edge, zones
-        self.out = []
+        self.prisms = []
 
-    def zone(self, s):
-        """DENSE, SUBURBAN or OPEN at s metres."""
-        return self.zones[int(s / 70)]
+    def put(self, s, out, half_x, half_y, z0, z1, albedo, fuzz=0.0, twist=0.0):
+        """A box at s metres along the road, `out` metres beyond its edge.
 
-    def put(self, s, left, half_x, half_y, z0, z1, albedo, fuzz=0.0, twist=0.0):
-        """A box at s metres along the road and `left` metres to its left."""
-        x, y, yaw = self.position(s, left)
-        self.out.append(_prisms(x, y, yaw + twist, half_x, half_y, z0, z1, albedo, fuzz, 0))
+        With half_y None, a cylinder of the radius half_x.
+        """
+        x, y, yaw = self.position(s, self.side * (self.edge + out))
+        self.prisms.append(_prisms(x, y, yaw + twist, half_x, half_y or half_x, z0, z1, albedo,
+                                   fuzz, half_y is None))
 
-    def put_round(self, s, left, radius, z0, z1, albedo, fuzz=0.0):
-        """A cylinder."""
-        x, y, yaw = self.position(s, left)
-        self.out.append(_prisms(x, y, yaw, radius, radius, z0, z1, albedo, fuzz, 1))
-
-    def tree(self, s, left):
+    def tree(self, s, out):
         """A trunk and a crown."""
         u = self.rng.uniform
         trunk, crown = u(0.1, 0.3), u(1.2, 3.2)  # radius of the trunk; where the crown begins
-        self.put_round(s, left, trunk, z0=0, z1=crown + 1, albedo=u(0.15, 0.35))
-        self.put_round(s, left, radius=u(1.2, 3.5), z0=crown, z1=crown + u(3, 7),
-                       albedo=u(0.2, 0.45), fuzz=u(0.5, 2.5))
+        self.put(s, out, trunk, None, z0=0, z1=crown + 1, albedo=u(0.15, 0.35))
+        self.put(s, out, u(1.2, 3.5), None, z0=crown, z1=crown + u(3, 7), albedo=u(0.2, 0.45),
+                 fuzz=u(0.5, 2.5))
 
     def plots(self):
         """Houses and gardens, one plot after the other."""
         rng, u, s = self.rng, self.rng.uniform, 0.0
         while s < self.length:
-            kind = self.zone(s)
+            kind = self.zones[int(s / 70)]
             plot = u(9, 22) if kind == DENSE else u(9, 16)  # its length along the road
             setback = u(*((3.5, 7), (6, 14), (8, 30))[kind])
-            facade = self.edge + setback
-            middle, albedo, depth = s + plot / 2, u(0.2, 0.42), u(7, 13)
+            middle = s + plot / 2
             if rng.random() < (0.95, 0.8, 0.3)[kind]:
-                self.house(middle, plot, facade, depth, albedo)
-            if kind != DENSE and rng.random() < 0.65:
-                self.border(middle, plot)
-            for _ in range(rng.poisson((0.6, 2, 2)[kind])):
-                self.plants(s, plot, facade)
-            # A gap to the next plot; some are side streets
-            wide = kind != DENSE or rng.random() < 0.35
-            s += plot + (u(5, 14) if wide else u(0, 1))
+                self.house(middle, setback, plot)
+            if kind != DENSE and rng.random() < 0.65:  # a hedge, or a wall or fence
+                thick, fuzz = (0.35, 0.25) if rng.random() < 0.6 else (0.1, 0)
+                self.put(middle, u(2.2, 3.2), plot * u(0.3, 0.48), thick, z0=0, z1=u(0.6, 1.9),
+                         albedo=u(0.2, 0.4), fuzz=fuzz)
+            for _ in range(rng.poisson((1, 3, 3)[kind])):  # a tree and a bush
+                self.tree(s + u(0, 1) * plot, u(3, setback + 3))
+                self.put(s + u(0, 1) * plot, u(3, 7), u(0.4, 1.2), None, z0=0, z1=u(0.5, 1.8),
+                         albedo=u(0.2, 0.4), fuzz=0.25)
+            # A gap to the next plot, wide or narrow
+            s += plot + (u(5, 14) if kind != DENSE or rng.random() < 0.35 else u(0, 1))
 
-    def house(self, middle, plot, facade, depth, albedo):
+    def house(self, s, setback, plot):
         """A house with bays, stairs and porches, without which all of a facade looks the same."""
-        rng, u, side = self.rng, self.rng.uniform, self.side
-        self.put(middle, side * (facade + depth / 2), plot / 2, depth / 2, z0=0, z1=u(5, 14),
-                 albedo=albedo, twist=rng.normal() * 0.02)
-        for _ in range(rng.integers(2, 6)):
-            s, out_by = middle + u(-0.45, 0.45) * plot, u(0.1, 0.5)
-            self.put(s, side * (facade - out_by), u(0.3, 1.5), out_by, z0=0, z1=u(1, 7),
-                     albedo=albedo * u(0.7, 1.3))
-
-    def border(self, middle, plot):
-        """A hedge, a wall or a fence between a plot and the road."""
-        u = self.rng.uniform
-        hedge = self.rng.random() < 0.6
-        thick, fuzz = (0.35, 0.25) if hedge else (0.1, 0)
-        self.put(middle, self.side * (self.edge + u(2.2, 3.2)), plot * u(0.3, 0.48), thick, z0=0,
-                 z1=u(0.6, 1.9), albedo=u(0.2, 0.4), fuzz=fuzz)
-
-    def plants(self, s, plot, facade):
-        """A tree and a bush in a garden."""
-        u, side, edge = self.rng.uniform, self.side, self.edge
-        self.tree(s + u(0, 1) * plot, side * u(edge + 3, facade + 3))
-        self.put_round(s + u(0, 1) * plot, side * (edge + u(3, 7)), radius=u(0.4, 1.2), z0=0,
-                       z1=u(0.5, 1.8), albedo=u(0.2, 0.4), fuzz=0.25)
+        u, depth, albedo = self.rng.uniform, self.rng.uniform(7, 13), self.rng.uniform(0.2, 0.42)
+        self.put(s, setback + depth / 2, plot / 2, depth / 2, z0=0, z1=u(5, 14), albedo=albedo,
+                 twist=self.rng.normal() * 0.02)
+        for _ in range(self.rng.integers(2, 6)):
+            thick = u(0.1, 0.5)
+            self.put(s + u(-0.45, 0.45) * plot, setback - thick, u(0.3, 1.5), thick, z0=0,
+                     z1=u(1, 7), albedo=albedo * u(0.7, 1.3))
 
     def parked_cars(self):
         """Cars along the edge of the road."""
         rng, s = self.rng, 0.0
         while s < self.length:
-            looks = _car_looks(rng)
-            if rng.random() < (0.55, 0.35, 0.06)[self.zone(s)]:
-                x, y, yaw = self.position(s, self.side * (self.edge + rng.uniform(1.0, 1.3)))
-                self.out.append(_cars(x, y, yaw + rng.normal() * 0.03, looks))
-            s += looks[0] + rng.uniform(0.6, 3)
+            car = _vehicles(rng, 1, PARKED)
+            if rng.random() < (0.7, 0.5, 0.1)[self.zones[int(s / 70)]]:
+                x, y, yaw = self.position(s, self.side * (self.edge + rng.uniform(1.2, 1.5)))
+                self.prisms.append(_place(car, x, y, yaw + rng.normal() * 0.03))
+            s += 2 * car[0, 0, HALF_X] + rng.uniform(0.6, 3)
+
+    def guard_rail(self, out):
+        """A guard rail `out` metres beyond the edge of the road."""
+        for s in np.arange(0, self.length, 4.0):
+            self.put(s, out, 2.0, 0.1, z0=0.4, z1=0.8, albedo=0.4)
 
     def pavement(self):
         """Trees, poles of lamps and signs, and boxes on the pavement."""
-        rng, u, side, edge, s = self.rng, self.rng.uniform, self.side, self.edge, 0.0
+        u, s = self.rng.uniform, 0.0
         while s < self.length:
-            choice = rng.random()
+            choice = u(0, 1)
             if choice < 0.35:
-                self.tree(s, side * (edge + u(2.2, 3)))
+                self.tree(s, u(2.2, 3))
             elif choice < 0.7:
-                self.put_round(s, side * (edge + u(0.5, 2.5)), radius=u(0.04, 0.12), z0=0,
-                               z1=u(2.5, 8), albedo=u(0.2, 0.6))
+                self.put(s, u(0.5, 2.5), u(0.04, 0.12), None, z0=0, z1=u(2.5, 8),
+                         albedo=u(0.2, 0.6))
             elif choice < 0.9:
-                self.put(s, side * (edge + u(2.2, 3)), u(0.2, 0.6), u(0.2, 0.4), z0=0,
-                         z1=u(0.7, 1.7), albedo=u(0.1, 0.6))
-            s += u(3, 14)
+                self.put(s, u(2.2, 3), u(0.2, 0.6), u(0.2, 0.4), z0=0, z1=u(0.7, 1.7),
+                         albedo=u(0.1, 0.6))
+            s += u(2, 11)
 
     def background(self):
-        """Houses, trees and thickets 12 to 75 m away, seen between the plots. On both sides."""
+        """Houses, trees and thickets up to 65 m away, seen between the plots."""
         rng, u = self.rng, self.rng.uniform
-        for _ in range(int(self.length / 2)):
-            s, left, house = u(0, self.length), rng.choice([-1, 1]) * u(12, 75), rng.random() < 0.3
-            if house:
-                self.put(s, left, u(4, 12), u(4, 8), z0=0, z1=u(4, 12), albedo=u(0.2, 0.4),
+        for _ in range(int(self.length / 4)):
+            s, out, choice = u(0, self.length), u(6, 65), rng.random()
+            if choice < 0.3:  # a house
+                self.put(s, out, u(4, 12), u(4, 8), z0=0, z1=u(4, 12), albedo=u(0.2, 0.4),
                          twist=rng.normal() * 0.3)
-            elif rng.random() < 0.4:
-                self.tree(s, left)
+            elif choice < 0.6:
+                self.tree(s, out)
             else:  # a thicket or the edge of a wood
-                self.put(s, left, u(1, 8), u(1, 4), z0=0, z1=u(1, 8), albedo=u(0.2, 0.45),
+                self.put(s, out, u(1, 8), u(1, 4), z0=0, z1=u(1, 8), albedo=u(0.2, 0.45),
                          fuzz=u(1, 4), twist=rng.normal() * 0.5)
 
 
-def _roadside(rng, position, length, odds):
-    """Draw everything that stands along a road of `length` metres -> prisms (n,10)."""
-    shares = np.array(odds) / sum(odds)
-    zones_right, zones_left = rng.choice(3, p=shares, size=(2, int(length / 70) + 1))
-    left = _Street(rng, position, length, 1, 1.5 * LANE, zones_left)
-    right = _Street(rng, position, length, -1, 0.5 * LANE, zones_right)
+def _roadside(rng, drive, lanes, style):
+    """Draw everything that stands along the road -> prisms (n,10)."""
+    shares = np.array(style.odds) / sum(style.odds)
+    zones = rng.choice(3, p=shares, size=(2, int(drive.length / 70) + 1))
+    left = _Street(rng, drive, 1, lanes[1].max() + LANE / 2, zones[0])
+    right = _Street(rng, drive, -1, LANE / 2 - lanes[0].min(), zones[1])
     for street in left, right:
         street.plots()
-        street.parked_cars()
         street.pavement()
-    right.background()
-    prisms = np.concatenate(left.out + right.out)
-
-    # Points in the middle of the two lanes
-    s = np.arange(0, length, 1.0)
-    lanes = np.concatenate([np.stack(position(s, left)[:2]) for left in (0, LANE)], axis=1)  # (2,m)
-
-    # Remove prisms on the road: those whose gap to such a point is too small, unless they are
-    # higher than a car, as the crowns of trees are
-    columns = prisms[:, [X, Y, YAW, HALF_X, HALF_Y]]
-    x, y, yaw, half_x, half_y = columns.T[:, :, None]  # (n,1) each
-    dx, dy, c, s = lanes[0] - x, lanes[1] - y, np.cos(yaw), np.sin(yaw)
-    gap_x = np.maximum(np.abs(c * dx + s * dy) - half_x, 0)  # (n,m), along the prism's own axes
-    gap_y = np.maximum(np.abs(c * dy - s * dx) - half_y, 0)  # (n,m)
-    gap = np.hypot(gap_x, gap_y).min(axis=1)  # (n,)
-    return prisms[(gap > 1.7) | (prisms[:, Z0] > 2.2)]
+        street.background()
+        if style.reservation:
+            street.guard_rail(1.5)
+        else:
+            street.parked_cars()
+    if style.reservation:  # in its middle
+        left.guard_rail(-len(lanes[1]) * LANE - style.reservation / 2)
+    return np.concatenate(left.prisms + right.prisms)
 
 
-def _ground(rng, position, length):
-    """Draw the ground: road, kerb, pavement and rough grass.
+def _ground(rng, drive, lanes, side_streets):
+    """Draw the ground: road and side streets, kerb, pavement and rough grass.
 
-    Returns the height and the albedo of every cell, and the corner (2,) of the raster.
+    Returns the height, 0 only on roads, and the albedo of every cell, and the raster's corner (2,).
     """
-    x, y, _ = position(np.arange(0, length, CELL / 2), LANE / 2)  # the middle of the road
-    corner = np.array([x.min(), y.min()]) - CITY_RANGE - 5
-    i, j = ((np.stack([x, y]) - corner[:, None]) / CELL).astype(int)
+    step = CELL / 2
+    along, across = np.arange(0, drive.length, step), np.arange(-SIDE_STREET, SIDE_STREET, step)
+    areas = [(along, np.arange(way.min() - LANE / 2 + step, way.max() + LANE / 2, step))
+             for way in lanes]
+    areas += [(np.arange(s - LANE + step, s + LANE, step), across) for s in side_streets]
+    points = [np.stack(drive.position(s[:, None], left)[:2]).reshape(2, -1) for s, left in areas]
+    points = np.concatenate(points, axis=1)  # (2,m)
+    corner = points.min(axis=1) - CITY_RANGE - 5
+    i, j = ((points - corner[:, None]) / CELL).astype(int)
     margin = int(90 / CELL)
     off_road = np.ones((i.max() + margin, j.max() + margin), bool)
     off_road[i, j] = False
-    away = distance_transform_edt(off_road).astype(np.float32) * CELL  # from the middle of the road
+    away = distance_transform_edt(off_road).astype(np.float32) * CELL  # from the road
     # Noise of standard deviation 1, about 4 m wide
     noise = gaussian_filter(rng.standard_normal(off_road.shape, dtype=np.float32), 8) * 28
-    paved = away > LANE
-    grass = np.clip((away - LANE - 2.5) / 6, 0, 1)  # from 0 on the pavement to 1
-    height = np.where(paved, 0.12, 0) + grass * np.clip(0.15 + 0.2 * noise, 0, 0.6)
-    albedo = 0.33 + np.where(paved, 0.03, 0) + 0.03 * noise - 0.04 * grass
+    grass = np.clip((away - 2.5) / 6, 0, 1)  # from 0 on the pavement to 1
+    height = np.where(off_road, 0.12, 0) + grass * np.clip(0.15 + 0.2 * noise, 0, 0.6)
+    albedo = 0.33 + np.where(off_road, 0.03, 0) + 0.03 * noise - 0.04 * grass
     return height.astype(np.float32), albedo.astype(np.float32), corner
+
+
+def _leave_road_free(prisms, ground):
+    """Whether prisms (n,10) leave the road free, or are higher than a car as crowns are -> (n,)."""
+    height, _, corner = ground
+    x, y, yaw, half_x, half_y = prisms[:, [X, Y, YAW, HALF_X, HALF_Y]].T[:, :, None, None]
+    along, across = half_x * np.linspace(-1, 1, 9)[:, None], half_y * np.linspace(-1, 1, 9)
+    x = x + along * np.cos(yaw) - across * np.sin(yaw)  # (n,9,9) points of each prism
+    y = y + along * np.sin(yaw) + across * np.cos(yaw)
+    i = np.clip((x - corner[0]) / CELL, 0, height.shape[0] - 1).astype(int)
+    j = np.clip((y - corner[1]) / CELL, 0, height.shape[1] - 1).astype(int)
+    return (height[i, j] > 0).all(axis=(1, 2)) | (prisms[:, Z0] > 2.2)
+
+
+# Traffic
+
+
+def _lane_with_us(rng, drive, t, left):
+    """Draw the vehicles of a lane in our direction: prisms (2,n,10), metres driven (n,scans).
+
+    Each does what the one before it does, a little later and some metres behind (Newell's model of
+    car following). All follow our own drive: they slow down in bends and queue at lights with us.
+    Vehicles to our left are faster than we are and those to our right slower, by 2 to 30 %.
+    """
+    own = drive.distance(t)
+    driven = own[-1] - own[0]
+    rate = 1 + np.sign(left) * rng.choice([0.02, rng.uniform(0.05, 0.3)])
+    # Twice as many as are ever seen at our mean speed
+    n = 1 + int((360 + 4 * abs(rate - 1) * driven) / (8 + 1.3 * driven / len(t) / 0.1))
+    vehicles = _vehicles(rng, n, MOVING)
+    half = vehicles[0, :, HALF_X, None]  # of the length (n,1)
+    offset = np.cumsum(2 * half + rng.uniform(2, 5, (n, 1)), axis=0) - half
+    lead = np.cumsum(rng.uniform(0.7, 2.0, n))[:, None]  # [s]
+    # The vehicle in the middle is beside us or, in our lane, in our place
+    offset, lead = offset - offset[n // 2], lead - lead[n // 2]
+    wave, phase = rng.uniform(0.2, 0.6, (n, 1)), rng.uniform(0, 6.3, (n, 1))
+    lead = lead + 0.25 * np.sin(wave * t + phase)  # (n,scans); distances are never quite constant
+    s = own[0] + offset + rate * (drive.distance(t + lead) - own[0])
+    # Those before us in our lane stand on this side of the light, so the side street stays free
+    free = (offset + half < 25)[:, 0] | (left != 0)
+    return vehicles[:, free], s[free]
+
+
+def _traffic(rng, drive, t, lanes, side_streets, style):
+    """Draw all vehicles on the road: moving(i) -> prisms (m,10) at scan i."""
+    # Groups of vehicles: prisms (2,n,10), metres along the road and to the left of our path, and
+    # angle to the road. The first is our own car; the sensor is 0.8 m ahead of its rear axle.
+    own = drive.distance(t)
+    car = _prisms(0, 0, 0, 2.5, 1.0, 0, 2, 0, 0, 0)[None].repeat(2, 0)
+    groups = [(car, own + 0.8, 0, 0)]
+    for left in lanes[0]:
+        groups.append((*_lane_with_us(rng, drive, t, left), left, 0))
+    for left in lanes[1]:  # towards us, at the speed of their lane
+        speed = style.cruise * rng.uniform(0.6, 1.0)
+        n = int((drive.length + speed * t[-1]) / 40)
+        start = np.cumsum(rng.uniform(20, 60, (n, 1)), axis=0)
+        groups.append((_vehicles(rng, n, MOVING), start - speed * t, left, np.pi))
+    for street in side_streets:  # across, at about the time when we are there
+        side, speed = rng.choice([-1, 1], (8, 1)), rng.uniform(4, 12, (8, 1))
+        our_time = t[np.searchsorted(own, street - 20).clip(0, len(t) - 1)]
+        left = side * speed * (t - our_time - rng.uniform(-8, 8, (8, 1)))
+        groups.append((_vehicles(rng, 8, MOVING), street + side * LANE / 2, left,
+                       side * np.pi / 2))
+
+    vehicles = np.concatenate([group[0] for group in groups], axis=1)  # (2,n,10)
+    s, left, turn = (np.concatenate([np.broadcast_to(group[k], (group[0].shape[1], len(t)))
+                                     for group in groups]) for k in (1, 2, 3))  # (n,scans) each
+    x, y, yaw = drive.position(s, left)
+    yaw = yaw + turn
+    seen = (np.hypot(x - x[0], y - y[0]) < CITY_RANGE + 10) & (np.abs(left) < SIDE_STREET)
+    seen &= (s > 0) & (s < drive.length)
+    _remove_collisions(x, y, yaw, seen, vehicles)
+    seen[0] = False  # our own car
+
+    def moving(i):
+        k = np.flatnonzero(seen[:, i])
+        return _place(vehicles[:, k], x[k, i], y[k, i], yaw[k, i])
+
+    return moving
+
+
+def _remove_collisions(x, y, yaw, seen, vehicles):
+    """Remove vehicles that ever run into one before them in the list: set seen (n,scans) False.
+
+    To decide that, a vehicle is a row of five discs.
+    """
+    half_x, half_y = vehicles[0, :, HALF_X, None] + 0.2, vehicles[0, :, HALF_Y, None] + 0.1
+    ends = np.linspace(-1, 1, 5)[:, None, None] * (half_x - half_y)
+    disc_x, disc_y = x + ends * np.cos(yaw), y + ends * np.sin(yaw)  # (5,n,scans)
+    for j in range(1, len(x)):
+        both = seen[:j] & seen[j] & (np.hypot(x[:j] - x[j], y[:j] - y[j]) < 20)
+        i, k = np.nonzero(both)  # the other vehicle and the scan
+        dx = disc_x[:, None, i, k] - disc_x[:, j, k]  # (5,5,m)
+        dy = disc_y[:, None, i, k] - disc_y[:, j, k]
+        if (np.hypot(dx, dy) < half_y[i, 0] + half_y[j]).any():
+            seen[j] = False
 
 
 class _World(NamedTuple):
@@ -1406,7 +1518,7 @@ class _World(NamedTuple):
     T: np.ndarray  # (scans,4,4) poses T_wt of the Velodyne
     T_flat: np.ndarray  # (scans,4,4) the same before the hills were added
     prisms: np.ndarray  # (n,10) everything that stands still
-    moving: Callable  # scan i -> prisms (m,10) of the cars on the road
+    moving: Callable  # scan i -> prisms (m,10) of the vehicles on the road
     ground: tuple  # height and albedo of every cell, corner of the raster
     height: Callable  # x, y -> height of the hills
 
@@ -1421,47 +1533,36 @@ def _world(name, seed, scans):
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
     t = np.arange(scans + 1) * 0.1  # [s]
     for _ in range(1000):  # draw again until the drive can be measured
-        position, distance, length = _drive(rng, scans, style)
-        s = distance(t)  # (scans + 1,)
-        if scans < 100 or _is_fast_and_winding(position, s):
+        drive = _drive(rng, scans, style)
+        s = drive.distance(t)  # (scans + 1,)
+        if scans < 100 or _is_measurable(drive, s):
             break
-    T = _sensor_poses(rng, position, distance, scans)
-    length = min(length, s[-1] + 120)  # the road farther ahead is not seen
-    prisms = _roadside(rng, position, length, style.odds)
-
-    # Cars on the road: one before us, one behind us, all others come towards us
-    n, t = 2 + int(length / 45), t[:-1]
-    looks = _car_looks(rng, n)  # (3,n)
-    left = np.where(np.arange(n) < 2, 0, LANE)  # (n,)
-    before, behind = distance(t + rng.uniform(1.6, 3)), distance(t - rng.uniform(1.6, 3))
-    start, speed = rng.uniform(60, length + 80, (n - 2, 1)), rng.uniform(6, 12, (n - 2, 1))
-    s = np.concatenate([[before, behind], start - speed * t])  # (n,scans)
-    on_road = (s > 0) & (s < length)
-
-    def moving(i):
-        k = on_road[:, i]
-        x, y, yaw = position(s[k, i], left[k])
-        return _cars(x, y, yaw, looks[:, k])
-
-    ground = _ground(rng, position, length)
+    drive = drive._replace(length=min(drive.length, s[-1] + 120))  # what is farther is not seen
+    T = _sensor_poses(rng, drive, scans)
+    # How far to the left of our path the lanes in our and in the other direction are. We drive in
+    # one drawn at random, at 0.
+    ours = (np.arange(style.lanes) - rng.integers(style.lanes)) * LANE
+    lanes = ours, ours.max() + style.reservation + LANE * np.arange(1, style.lanes + 1)
+    # Side streets are at the light before every halt and elsewhere, where the road is straight
+    at = np.r_[drive.halts + 30, rng.uniform(0, drive.length, int(drive.length / 120))]
+    turn = drive.position(at + 8)[2] - drive.position(at - 8)[2]
+    side_streets = at[(np.abs(turn) < 0.1) & (style.reservation == 0)]
+    ground = _ground(rng, drive, lanes, side_streets)
+    prisms = _roadside(rng, drive, lanes, style)
+    prisms = prisms[_leave_road_free(prisms, ground)]
+    moving = _traffic(rng, drive, t[:-1], lanes, side_streets, style)
     height, T_hills = _hills(rng, T)
     return _World(T_hills, T, prisms, moving, ground, height)
 
 
-def _is_fast_and_winding(position, s):
-    """Whether a drive has segments of 100 m in which errors of rotation matter.
+def _is_measurable(drive, s):
+    """Whether a drive is long enough for segments of 100 m, and errors of rotation matter in it.
 
     s (scans + 1,): distances along the road, 0.1 s apart.
     """
-    fast = s[-1] - s[0] > 0.72 * (len(s) - 1)
-    turn = np.degrees(np.diff(position(s)[2]))  # yaw of every step
-    turning = 0.9 < turn.std() < 1.45 and min(turn.max(), -turn.min()) > 0.5
-    # How far off a segment of 100 m would end without turning, on average
-    start = s[s <= max(s[-1] - 100, s[0])]
-    x, y, yaw = position(start)
-    x_end, y_end, _ = position(start + 100)
-    astray = np.hypot(x + 100 * np.cos(yaw) - x_end, y + 100 * np.sin(yaw) - y_end).mean()
-    return fast and turning and astray > 45
+    far = s[-1] - s[0] > 0.7 * min(len(s) - 1, 170)
+    turn = np.degrees(np.diff(drive.position(s)[2]))  # yaw of every step
+    return far and turn.std() > 0.85 and min(turn.max(), -turn.min()) > 0.5
 
 
 # The sensor
@@ -1669,7 +1770,7 @@ def _simulate_scan(name, seed, scans, azimuth, i):
 
     # Intensity. From 60 m on, KITTI's intensities are mostly 0.
     light = albedo * (0.65 + 0.4 * np.sqrt(cosine)) + 0.08 * noise() - 0.01 * np.maximum(r - 25, 0)
-    light[uniform() <= 0.08] *= 0  # some are lost; keeps the sign, so that files stay the same
+    light[uniform() <= 0.08] = 0  # some are lost
 
     # Drop-outs: far and dark, grazing, or very dark
     far = 0.10 * (r / 40) ** 2 * (0.15 / (0.05 + albedo))
@@ -1752,6 +1853,11 @@ def _missing_sequences(root, names, seed, scans, azimuth):
             # Another process may be making it, so look at its settings only now
             made = folder / "simulated.json"
             found = made.read_text() if made.exists() else "not simulated"
+            city = re.match(r'\{"city": (\d+)', found)
+            if city and int(city[1]) != CITY:
+                raise ValueError(f"{root} has scans of the simulated city, version {city[1]}, but "
+                                 f"this code makes version {CITY}: delete or rename that folder, "
+                                 "then run the same command again.")
             if found != json.dumps(settings):
                 raise ValueError(f"{folder} or {truth} is there already, {found} and not "
                                  f"{json.dumps(settings)}: choose another folder.")

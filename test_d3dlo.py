@@ -1144,7 +1144,7 @@ def test_simulation_is_the_same_in_any_order_and_with_any_workers_and_keeps_file
 
 
 def test_simulated_scans_are_in_kittis_layout_and_fit_their_poses(tmp_path):
-    root = kitti.simulate(tmp_path, sequences=("00",), scans=3, azimuth=900, workers=1)
+    root = kitti.simulate(tmp_path, sequences=("02",), scans=3, azimuth=900, workers=1)
     s, = kitti.open_sequences(root)
     assert len(s) == len(s.poses) == 3
     assert_allclose(s.poses[0], np.eye(4), atol=1e-8)
@@ -1180,7 +1180,74 @@ def test_simulated_test_sequences_are_long_and_winding_enough_to_be_evaluated(tm
     steps = np.concatenate(steps)
     # The true translation without any rotation must not score well
     assert metrics.kitti_errors(errors)[0] > 40
-    assert steps[:, 5].std() > 0.9 and 0.8 < np.linalg.norm(steps[:, :3], axis=1).mean() < 1.2
+    metres, degrees = np.linalg.norm(steps[:, :3], axis=1), np.abs(steps[:, 5])
+    assert degrees.std() > 0.9 and 0.8 < metres.mean() < 1.2
+    # A motorway, ramps and roundabouts, and a halt
+    assert metres.max() > 2.5 and np.mean(metres > 1.5) > 0.05
+    assert np.mean((metres > 0.8) & (2 < degrees) & (degrees < 3.5)) > 0.05
+    assert np.mean(metres < 0.01) > 0.01
+
+
+def footprints(prisms, n=15):
+    """Points x, y (m,n,n) that cover m prisms (m,10) in plan."""
+    u = np.linspace(-1, 1, n)
+    x, y, yaw, half_x, half_y = prisms[:, :5].T[:, :, None, None]
+    along, across = half_x * u[:, None], half_y * u
+    return (x + along * np.cos(yaw) - across * np.sin(yaw),
+            y + along * np.sin(yaw) + across * np.cos(yaw))
+
+
+@pytest.mark.parametrize("name", ["01", "05", "06"])
+def test_simulated_vehicles_drive_with_us_on_a_free_road_and_never_into_us(name):
+    scans = 170
+    world = kitti._world(name, 0, scans)
+    height, _, corner = world.ground
+
+    def on_road(x, y):
+        i, j = (((xy - origin) / kitti.CELL).astype(int) for xy, origin in zip((x, y), corner))
+        i, j = i.clip(0, height.shape[0] - 1), j.clip(0, height.shape[1] - 1)
+        return height[i, j] == 0
+
+    low = world.prisms[world.prisms[:, kitti.Z0] < 2]
+    assert len(low) > 200 and on_road(*world.T_flat[:, :2, 3].T).all()
+    assert on_road(*footprints(low)).mean() < 1e-4
+    near, with_us, towards_us = [], 0, 0  # vehicles of a scan, and sums of all scans
+    for i in range(scans):
+        bodies, cabins = np.split(world.moving(i), 2)
+        assert len(bodies) == len(cabins) and on_road(bodies[:, 0], bodies[:, 1]).mean() > 0.9
+        T = world.T_flat[i]
+        yaw = np.arctan2(T[1, 0], T[0, 0])
+        x, y = footprints(np.concatenate([bodies, cabins]))
+        x, y = x - T[0, 3], y - T[1, 3]
+        ahead, left = x * np.cos(yaw) + y * np.sin(yaw), y * np.cos(yaw) - x * np.sin(yaw)
+        assert not ((np.abs(ahead) < 2.4) & (np.abs(left) < 0.9)).any()  # our own car
+        close = np.hypot(bodies[:, 0] - T[0, 3], bodies[:, 1] - T[1, 3]) < 30
+        cosine = np.cos(bodies[close, 2] - yaw)
+        near.append(close.sum())
+        with_us += np.sum(cosine > 0.7)
+        towards_us += np.sum(cosine < -0.7)
+    assert np.mean(near) > 2 and with_us > scans and towards_us > 0.3 * scans
+
+
+def test_vehicles_around_us_stand_in_a_queue_at_a_light_and_start_with_us():
+    world = kitti._world("05", 0, 170)
+    steps = np.linalg.norm(np.diff(world.T_flat[:, :2, 3], axis=0), axis=1)
+    stands = np.flatnonzero(steps < 0.01)
+    assert len(stands) >= 8
+
+    def vehicles(i):
+        """Bodies around us in the world, by looks: vehicles have no names."""
+        bodies = np.split(world.moving(i), 2)[0]
+        T = world.T_flat[i]
+        near = np.hypot(bodies[:, 0] - T[0, 3], bodies[:, 1] - T[1, 3]) < 30
+        return {tuple(b[kitti.HALF_X:]): b[:2] for b in bodies[near]}
+
+    i = stands[len(stands) // 2]
+    before, now, after = vehicles(i - 1), vehicles(i), vehicles(i + 60)
+    moved = {look: np.linalg.norm(now[look] - before[look]) for look in now.keys() & before.keys()}
+    standing = [look for look, step in moved.items() if step < 0.01]
+    assert len(standing) >= 2
+    assert any(look in after and np.linalg.norm(after[look] - now[look]) > 5 for look in standing)
 
 
 @pytest.mark.skipif(not KITTI.is_dir(), reason="D3DLO_KITTI names no folder")
@@ -2348,6 +2415,12 @@ def test_simulate_on_the_command_line(cwd, city, capsys):
     for change, words in {"--azimuth 400": "07", "--azimuth 3": "azimuth", "--scans 0": "scans",
                           "--sequences ../x": "../x"}.items():
         fails_with_one_line(kitti.main, arguments + change.split(), words, capsys)
+    # Scans of an earlier city are refused, and the message says what to do
+    made = cwd / "city" / "sequences" / "07" / "simulated.json"
+    settings = made.read_text()
+    made.write_text(settings.replace(f'"city": {kitti.CITY}', '"city": 3'))
+    fails_with_one_line(kitti.main, arguments, "delete or rename that folder", capsys)
+    made.write_text(settings)
     # Real data are never overwritten
     over_real_data = "simulate real --sequences 00 --scans 2".split()
     fails_with_one_line(kitti.main, over_real_data, "00", capsys)
