@@ -400,31 +400,31 @@ def move_scans(scans, T):
     return moved
 
 
-KEYFRAME_DISTANCE, KEYFRAME_ANGLE = 5.0, 20.0  # [m], [deg]: Odometry's keyframes when it refines
-ALIGNED = 1 / 3  # share of the pairs in augmented training that are aligned, as refinement does
+ALIGNED = 1 / 3  # share of the augmented pairs that look as they do in refinement
+KEYFRAME_DISTANCE, KEYFRAME_ANGLE = 5.0, 20.0  # [m], [deg] at which refinement takes a new keyframe
 
 
 def augment(scans, T_pq, aligned, rng):
     """Mirror half of the pairs left to right, then move every Q by a small random motion.
 
-    Records of scans (2n,), all P and then all Q, and poses (n,4,4) -> the same, changed. Where
-    `aligned` (n,) is true, Q is aligned with P first, and moved less. After mirroring, a point q
-    becomes A q and T_pq becomes T_pq A^-1. Not in the paper.
+    Records of scans (2n,), all P and then all Q, and poses T_pq (n,4,4) -> the changed ones. Pairs
+    for which `aligned` (n,) is true are aligned first, and then moved less. If A is the motion that
+    moves a point q of the mirrored Q to A q, the new pose is T_pq A^-1. Not in the paper.
     """
     n = len(T_pq)
     mirror = np.where(rng.random((n, 1, 1)) < 0.5, np.diag([1.0, -1, 1, 1]), np.eye(4))
     T_pq = mirror @ T_pq @ mirror
     scale = [0.25, 0.1, 0.03, 0.1, 0.1, 1.0]  # m, degrees; most in yaw: turns are rare
-    size = np.where(aligned, rng.random(n), 1.0)  # refinement meets errors of all sizes
+    size = np.where(aligned, rng.random(n), 1.0)  # small ones, too, as left by earlier passes
     small = from_vector(rng.normal(size=(n, 6)) * scale * size[:, None])
     A = small @ np.where(aligned[:, None, None], T_pq, np.eye(4))
     return move_scans(scans, np.concatenate([mirror, A @ mirror])), T_pq @ invert(A)
 
 
 def later_scan(motions, i, rng):
-    """Draw a scan up to KEYFRAME_DISTANCE metres farther along the path than scan i.
+    """Draw the number of a scan that is up to KEYFRAME_DISTANCE metres farther along the path.
 
-    motions: T_{t,t+1} (n-1,4,4) of its sequence. The scan is the next one if no other is as near.
+    motions: T_{t,t+1} (n-1,4,4) of the sequence. It is the next scan, i + 1, if no other is near.
     """
     ahead = np.cumsum(np.linalg.norm(motions[i:, :3, 3], axis=1))  # distance to i+1, i+2, ... [m]
     return i + max(1, np.searchsorted(ahead, rng.uniform(0, KEYFRAME_DISTANCE), "right"))
@@ -433,8 +433,8 @@ def later_scan(motions, i, rng):
 def training_batch(geometry, motions, pairs, config, rng, device="cpu"):
     """Pairs (n,2) of (sequence, scan) -> Batch and the poses T_pq (B,4,4) of its pairs.
 
-    P is that scan and Q the next one. With augmentation, a share of the pairs are as refinement has
-    them: Q may be several scans later, and is aligned with P up to a small motion.
+    P is that scan and Q the next one. With augmentation, some pairs are like those in refinement: Q
+    may be several scans later, and is aligned with P up to a small motion.
     """
     n = len(pairs)
     aligned = rng.random(n) < ALIGNED if config.augment else np.zeros(n, bool)
@@ -457,13 +457,13 @@ def training_batch(geometry, motions, pairs, config, rng, device="cpu"):
 def steps_per_epoch(motions, config):
     """Number of batches in an epoch, in which every pair occurs once.
 
-    A batch has `config.batch` pairs or more, but fewer than twice as many. ValueError when it would
-    hold one direction of one pair, which has no batch statistics.
+    A batch has `config.batch` pairs or more, but fewer than twice as many. Raises ValueError if it
+    would hold only one direction of one pair, which has no batch statistics.
     """
     pairs = sum(map(len, motions))
     if config.swap == "random" and min(pairs, config.batch) < 2:
-        raise ValueError(f"batches of {config.batch} pairs, {pairs} in all, one direction of each: "
-                         "batch normalisation needs at least 2 in a batch")
+        raise ValueError(f"batch size {config.batch} with {pairs} training pairs: batch "
+                         "normalisation needs at least 2 pairs per batch")
     return max(1, pairs // config.batch)
 
 
@@ -842,7 +842,7 @@ def predict(net, scans, p, q, device):
 
 
 def mean_motion(motions):
-    """Motions (n,4,4) that differ little -> their mean (4,4), a rigid motion."""
+    """Similar rigid motions (n,4,4) -> their mean (4,4), which is rigid again."""
     motions = np.stack(motions)
     T = np.eye(4)
     T[:3, :3] = Rotation.from_matrix(motions[:, :3, :3]).mean().as_matrix()
@@ -851,16 +851,17 @@ def mean_motion(motions):
 
 
 def predict_refined(net, keyframe, scan, guess, device):
-    """Records of P and Q, n samplings of each (n,), and a guess of T_pq -> T_pq (4,4).
+    """n samplings of P and of Q, records (n,) each, and a guess of T_pq -> T_pq (4,4).
 
-    Each pass takes a new sampling of both scans, aligns Q with the estimate so far, and adds the
-    residual motion, predicted in both directions and averaged. The result is the mean of the n
-    estimates, since their errors come mostly from the choice of centroids. Not in the paper.
+    There is one pass for each sampling. It aligns Q with the estimate so far, predicts the residual
+    motion in both directions, and updates the estimate. The result is the mean of all n estimates,
+    because most of their error depends on which points were sampled. Not in the paper.
     """
-    T, estimates, forth, back = guess, [], np.array([0, 1]), np.array([1, 0])
+    T, estimates = guess, []
     for p, q in zip(keyframe, scan):
         aligned, = move_scans(q[None], T[None])
-        T_pq, T_qp = predict(net, np.stack([p, aligned]), forth, back, device)
+        pair = np.stack([p, aligned])
+        T_pq, T_qp = predict(net, pair, np.array([0, 1]), np.array([1, 0]), device)
         T = mean_motion([T_pq, invert(T_qp)]) @ T
         estimates.append(T)
     return mean_motion(estimates)
@@ -869,9 +870,9 @@ def predict_refined(net, keyframe, scan, guess, device):
 def several_samplings(scan, config, n):
     """Sample a scan n times: (N,4) -> records (n,), see `scan_geometry`. Not in the paper.
 
-    Sampling k takes its centroids from every n-th point, starting with point k, so no two samplings
-    share one, unless there are too few points. The neighbours come from the whole scan. A second
-    thread groups one sampling while the next is drawn.
+    Sampling k takes its centroids from points k, k + n, k + 2n, ..., so that no two samplings share
+    a centroid, unless there are too few points. Neighbours are searched in the whole scan. A second
+    thread groups each sampling while the next one is drawn.
     """
     scan, broken = usable_scan(scan, config)
     cloud = np.ascontiguousarray(scan[:, :3])
@@ -907,10 +908,13 @@ UNLIKE = "scans look unlike the training data; the poses may be wrong"
 class Odometry:
     """Poses from a stream of scans: `Odometry().register(scan)`.
 
-    weights: a weights file or the folder of a training run, None for the weights beside this file;
-    refine: 0 for the paper's plain prediction, n to refine it in n passes, see `predict_refined`;
-    network: the class of the network. ValueError for an invalid argument, ValueError or
-    FileNotFoundError for weights that cannot be read.
+    weights: a weights file or the folder of a training run. None: the pretrained weights.
+    device: cpu, cuda or mps.
+    refine: number of refinement passes, see `predict_refined`. 0: the paper's plain prediction.
+    network: the class of the network.
+
+    Raises ValueError if an argument or the weights are invalid, and FileNotFoundError if there is
+    no such weights file.
     """
 
     def __init__(self, weights: str | Path | None = None, device: str = "cpu", refine: int = 0,
@@ -930,8 +934,8 @@ class Odometry:
     def register(self, scan: np.ndarray) -> np.ndarray:
         """Scan (N,4): x, y, z [m], intensity 0 to 1 -> its pose T_0t (4,4), Velodyne frame.
 
-        The first pose is the identity. Warns about broken points, and about scans unlike those in
-        training. ValueError for a scan that cannot be used; the state is then unchanged.
+        The first pose is the identity. Warns about invalid points, and about scans unlike those in
+        training. Raises ValueError if the scan cannot be used; the state is then unchanged.
         """
         records = several_samplings(scan, self.net.config, max(self.refine, 1))
         if records[0]["broken"]:
@@ -943,16 +947,13 @@ class Odometry:
         return pose
 
     def register_records(self, records):
-        """Samplings of the next scan (max(refine, 1),), see `several_samplings` -> its pose (4,4).
-
-        Eq. 1 gives the pose from the motion since the last scan. With `refine`, the pose is then
-        refined against a keyframe, an earlier scan that is replaced from time to time: the error of
-        a registration adds up once a keyframe, not once a scan.
-        """
+        """`register` for a scan that is sampled already: records (max(refine, 1),) -> its pose."""
         pose = self.pose
-        if self.last is not None:
+        if self.last is not None:  # eq. 1
             motion, = predict_motions(self.net, np.stack([self.last, records[0]]), self.device)
             pose = pose @ motion
+        # Refine the pose against a keyframe, an earlier scan that is replaced every few metres.
+        # Errors then add up from keyframe to keyframe, not from scan to scan.
         if self.keyframe is not None:
             guess = invert(self.keyframe_pose) @ pose
             T = predict_refined(self.net, self.keyframe, records, guess, self.device)
@@ -964,7 +965,7 @@ class Odometry:
 
 
 def is_far(T):
-    """Whether a motion (4,4) asks for a new keyframe."""
+    """Whether a scan at the pose T (4,4) relative to the keyframe becomes the next keyframe."""
     angle = np.degrees(Rotation.from_matrix(T[:3, :3]).magnitude())
     return np.linalg.norm(T[:3, 3]) >= KEYFRAME_DISTANCE or angle >= KEYFRAME_ANGLE
 
@@ -973,7 +974,8 @@ def relative_pose(scan_p: np.ndarray, scan_q: np.ndarray, weights: str | Path | 
                   refine: int = 0) -> np.ndarray:
     """Scans P and Q, (N,4) each -> T_pq (4,4), which maps points of Q into P's Velodyne frame.
 
-    Loads the weights at every call, so `Odometry` is faster for many scans. Errors as there.
+    Translation in metres. Loads the weights at every call, so `Odometry` is faster for many scans.
+    Raises the same errors as `Odometry` and `Odometry.register`.
     """
     odometry = Odometry(weights, refine=refine)
     odometry.register(scan_p)
@@ -1223,8 +1225,8 @@ def farthest_point_sampling(xyz: np.ndarray, n: int, start: int = 0) -> np.ndarr
 
     The cloud is cut into chunks of neighbouring points. A new centroid can only shorten distances
     in chunks whose bounding box is nearer to it than their largest `min_dist`; all other chunks
-    are skipped. Exact and nested: the first m of n indices are those of n = m. ValueError unless
-    0 < n <= N and 0 <= start < N.
+    are skipped. The result is nested: the first m of n indices are those of n = m. Raises
+    ValueError unless 0 < n <= N and 0 <= start < N.
     """
     xyz = np.asarray(xyz)
     if not (0 < n <= len(xyz) and 0 <= start < len(xyz)):
@@ -1232,6 +1234,7 @@ def farthest_point_sampling(xyz: np.ndarray, n: int, start: int = 0) -> np.ndarr
                          f"must be 1 to {len(xyz)}, start below that")
     xyz = np.asarray(xyz, np.float32 if xyz.dtype == np.float32 else np.float64)
     order = morton_order(xyz)
+    # Repeat the last point to fill the last chunk. This changes no distance and no maximum.
     order = np.pad(order, (0, -len(order) % CHUNK), mode="edge").reshape(-1, CHUNK)
     points = np.ascontiguousarray(xyz[order].transpose(0, 2, 1))  # (chunks,3,CHUNK)
     low, high = points.min(2).T.copy(), points.max(2).T.copy()  # (3,chunks) bounding boxes
@@ -1240,16 +1243,19 @@ def farthest_point_sampling(xyz: np.ndarray, n: int, start: int = 0) -> np.ndarr
     centroids = np.empty(n, np.int64)
     centroids[0] = start
     for i in range(1, n):  # take and reduce have less overhead than indexing and sum
+        # Chunks that the last centroid can affect: their bounding box is near enough
         p = xyz[centroids[i - 1], :, None]  # (3,1)
         gap = np.maximum(np.maximum(low - p, p - high), 0)  # (3,chunks) from p to the boxes
         gap *= gap
         near = (np.add.reduce(gap, 0) < largest).nonzero()[0]
+        # Update the squared distances in these chunks
         d = points.take(near, 0)  # (near,3,CHUNK); summed in the same order as the gap
         d -= p
         d *= d
         d = np.minimum(np.add.reduce(d, 1), min_dist.take(near, 0))
         min_dist[near] = d
         largest[near] = np.maximum.reduce(d, 1)
+        # The next centroid: the lowest index among the farthest points of all chunks
         best = (largest == np.maximum.reduce(largest)).nonzero()[0]
         d = min_dist.take(best, 0)
         centroids[i] = order.take(best, 0)[d == np.maximum.reduce(d, None)].min()
@@ -1706,8 +1712,8 @@ def eval_options(command):
     add("--weights", metavar="FILE|RUN", help=(
         "weights, or the folder of a training run (default: the pretrained weights)"))
     add("--refine", type=int, metavar="N", help=(
-        "not in the paper: average both directions, then align the scans and predict the residual "
-        "motion, N times (default: 0)"))
+        "not in the paper: refine each pose in N passes, each with a new sampling of the scan, "
+        "against a keyframe; 4 is recommended (default: 0)"))
     add("--device", help="cpu, cuda or mps (default: cpu)")
     add = command.add_argument_group("results").add_argument
     add("--out", metavar="DIR", help=(
