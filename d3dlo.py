@@ -871,24 +871,22 @@ def several_samplings(scan, config, n):
     """Sample a scan n times: (N,4) -> records (n,), see `scan_geometry`. Not in the paper.
 
     Sampling k takes its centroids from points k, k + n, k + 2n, ..., so that no two samplings share
-    a centroid, unless there are too few points. Neighbours are searched in the whole scan. A second
-    thread groups each sampling while the next one is drawn.
+    a centroid, unless there are too few points. Neighbours are searched in the whole scan.
     """
     scan, broken = usable_scan(scan, config)
     cloud = np.ascontiguousarray(scan[:, :3])
-    with ThreadPoolExecutor(1) as thread:
-        tree = thread.submit(build_tree, cloud)
+    parts = min(n, len(cloud) // config.sa1.n_fps)
+    size = len(cloud) // parts
+    clouds = cloud[:size * parts].reshape(size, parts, 3).swapaxes(0, 1)  # (parts,size,3)
+    with ThreadPoolExecutor(2) as threads:
+        tree = threads.submit(build_tree, cloud)  # while the main thread samples
+        centroids = farthest_point_samplings(clouds, config.sa1.n_fps) * parts  # (parts,n1)
+        centroids += np.arange(parts)[:, None]
 
-        def group(centroids):
-            return group_scan(scan, broken, centroids, tree.result(), config)
+        def group(k):
+            return group_scan(scan, broken, centroids[k % parts], tree.result(), config)
 
-        parts = min(n, len(cloud) // config.sa1.n_fps)
-        jobs = []
-        for k in range(n):
-            part = np.arange(k % parts, len(cloud), parts)
-            centroids = part[farthest_point_sampling(cloud[part], config.sa1.n_fps)]
-            jobs.append(thread.submit(group, centroids))
-        return np.stack([job.result() for job in jobs])
+        return np.stack([*threads.map(group, range(n))])
 
 
 def predict_motions(net, records, device="cpu", batch=16):
@@ -1220,6 +1218,19 @@ def morton_order(xyz):
     return np.argsort(SPREAD_BITS[a] | SPREAD_BITS[r] << 1, kind="stable")
 
 
+def cut_into_chunks(xyz):
+    """Points (N,3) -> m chunks of neighbouring points, with their bounding boxes.
+
+    Returns the indices of the points (m,CHUNK), the points (m,3,CHUNK), and the lowest and highest
+    coordinates of each chunk (3,m).
+    """
+    order = morton_order(xyz)
+    # Repeat the last point to fill the last chunk. This changes no distance and no maximum.
+    order = np.pad(order, (0, -len(order) % CHUNK), mode="edge").reshape(-1, CHUNK)
+    points = np.ascontiguousarray(xyz[order].transpose(0, 2, 1))
+    return order, points, points.min(2).T.copy(), points.max(2).T.copy()
+
+
 def farthest_point_sampling(xyz: np.ndarray, n: int, start: int = 0) -> np.ndarray:
     """`fps_textbook`, faster: xyz (N,3), finite -> (n,) int64 indices, ties to the lowest index.
 
@@ -1233,11 +1244,7 @@ def farthest_point_sampling(xyz: np.ndarray, n: int, start: int = 0) -> np.ndarr
         raise ValueError(f"farthest point sampling of {n} among {len(xyz)} points from {start}: n "
                          f"must be 1 to {len(xyz)}, start below that")
     xyz = np.asarray(xyz, np.float32 if xyz.dtype == np.float32 else np.float64)
-    order = morton_order(xyz)
-    # Repeat the last point to fill the last chunk. This changes no distance and no maximum.
-    order = np.pad(order, (0, -len(order) % CHUNK), mode="edge").reshape(-1, CHUNK)
-    points = np.ascontiguousarray(xyz[order].transpose(0, 2, 1))  # (chunks,3,CHUNK)
-    low, high = points.min(2).T.copy(), points.max(2).T.copy()  # (3,chunks) bounding boxes
+    order, points, low, high = cut_into_chunks(xyz)
     min_dist = np.full(order.shape, np.inf, xyz.dtype)  # (chunks,CHUNK), squared
     largest = min_dist[:, 0].copy()  # (chunks,) the largest of each chunk
     centroids = np.empty(n, np.int64)
@@ -1260,6 +1267,44 @@ def farthest_point_sampling(xyz: np.ndarray, n: int, start: int = 0) -> np.ndarr
         d = min_dist.take(best, 0)
         centroids[i] = order.take(best, 0)[d == np.maximum.reduce(d, None)].min()
     return centroids
+
+
+def farthest_point_samplings(clouds, n):
+    """`farthest_point_sampling` of K clouds at a time: (K,N,3) -> indices (K,n), the first 0.
+
+    For small clouds most of the time is NumPy's overhead, which one loop for all clouds shares.
+    """
+    (K, N), xyz = clouds.shape[:2], np.concatenate(clouds)  # (K*N,3)
+    if K == 1:
+        return farthest_point_sampling(xyz, n)[None]
+    orders, points, low, high = zip(*map(cut_into_chunks, clouds))
+    order = np.concatenate([order + k * N for k, order in enumerate(orders)])  # (K*m,CHUNK)
+    points = np.concatenate(points)  # (K*m,3,CHUNK)
+    low, high = np.stack(low, 1), np.stack(high, 1)  # (3,K,m)
+    cloud_of_chunk = np.repeat(np.arange(K), low.shape[2])  # (K*m,)
+    min_dist = np.full(order.shape, np.inf, xyz.dtype)  # (K*m,CHUNK), squared
+    largest = np.full(low.shape[1:], np.inf, xyz.dtype)  # (K,m) the largest of each chunk
+    largest_of_chunk = largest.reshape(-1)  # (K*m,), the same memory
+    centroids = np.empty((n, K), np.int64)
+    centroids[0] = np.arange(K) * N
+    for i in range(1, n):  # the same steps as in `farthest_point_sampling`
+        p = xyz.take(centroids[i - 1], 0)  # (K,3)
+        p_T = p.T[:, :, None]  # (3,K,1)
+        gap = np.maximum(np.maximum(low - p_T, p_T - high), 0)  # (3,K,m)
+        gap *= gap
+        near = (np.add.reduce(gap, 0) < largest).reshape(-1).nonzero()[0]
+        d = points.take(near, 0)  # (near,3,CHUNK)
+        d -= p.take(cloud_of_chunk.take(near), 0)[:, :, None]
+        d *= d
+        d = np.minimum(np.add.reduce(d, 1), min_dist.take(near, 0))
+        min_dist[near] = d
+        largest_of_chunk[near] = np.maximum.reduce(d, 1)
+        best = (largest == np.maximum.reduce(largest, 1, keepdims=True)).reshape(-1).nonzero()[0]
+        farthest = min_dist.take(best, 0) == largest_of_chunk.take(best)[:, None]
+        lowest = np.where(farthest, order.take(best, 0), K * N).min(1)  # (best,)
+        centroids[i] = K * N
+        np.minimum.at(centroids[i], cloud_of_chunk.take(best), lowest)
+    return centroids.T - np.arange(K)[:, None] * N
 
 
 def build_tree(xyz):

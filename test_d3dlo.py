@@ -212,6 +212,15 @@ def test_farthest_point_sampling_returns_the_same_indices_as_fps_textbook(seed, 
     assert_array_equal(farthest_point_sampling(xyz, n, start), fps_textbook(xyz, n, start))
 
 
+@given(SEED, st.integers(1, 5), st.integers(20, 700))
+def test_farthest_point_samplings_are_those_of_each_cloud(seed, K, N):
+    rng = generator(seed)
+    clouds = np.stack([random_scan(rng, N)[:, :3] for _ in range(K)])
+    clouds[0] = np.round(clouds[0] / 10)  # with many ties
+    expected = [fps_textbook(xyz, 20) for xyz in clouds]
+    assert_array_equal(d3dlo.farthest_point_samplings(clouds, 20), expected)
+
+
 @pytest.mark.parametrize("N, n", [(5, 6), (5, 0), (0, 1), (1023, 1024)])
 def test_farthest_point_sampling_refuses_0_samples_or_more_than_there_are_points(N, n):
     with pytest.raises(ValueError, match=f"{n} .*{N}"):
@@ -1662,7 +1671,7 @@ def test_samplings_share_no_centroid_and_are_grouped_in_the_whole_scan(seed, n, 
     parts = min(n, points // SMALL.sa1.n_fps)  # fewer parts where there are too few points
     tree = cKDTree(scan[:, :3])
     for k, record in enumerate(records):
-        part = np.arange(points)[k % parts::parts]
+        part = np.arange(points // parts * parts)[k % parts::parts]
         centroids = part[fps_textbook(scan[part, :3], SMALL.sa1.n_fps)]
         assert_array_equal(record, d3dlo.group_scan(scan, 0, centroids, tree, SMALL))
     assert len(records) == n
