@@ -93,10 +93,10 @@ class Config:
     batch: int = 16  # pairs of scans in a batch; the paper does not say
     optimizer: str = "adam"  # the paper's; or ours, "muon": Muon for the hidden matrices
     lr: float = 1e-3  # learning rate: Adam's default; with "one-cycle" the peak
-    schedule: str = "steps"  # lr drops at epochs 300 and 400 (by 10, ours); or "one-cycle"
+    schedule: str = "steps"  # lr / 10 (factor ours) after 3/5 and 4/5 of the steps; or "one-cycle"
     swap: str = "random"  # the paper's: one direction of each pair; or ours, "both"
     augment: bool = False  # ours: also mirror pairs and move Q by small random motions
-    frozen: float = 0.0  # ours: final fraction of steps, with fixed BatchNorm statistics
+    frozen: float = 0.0  # ours: share of the steps, at the end, with fixed BatchNorm statistics
 
     def __post_init__(self):
         for name in ("sa1", "fe", "sa2", "sa3", "mpn", "mlp"):  # from JSON, tuples are lists
@@ -224,7 +224,7 @@ def usable_scan(scan, config):
     """
     scan, broken = kitti.usable_points(scan, config.max_range, config.plane)
     if len(scan) < config.sa1.n_fps:
-        reach = config.max_range or kitti.BROKEN_RANGE
+        reach = config.max_range or kitti.MAX_VALID_RANGE
         raise ValueError(f"{len(scan)} usable points (finite, within {reach:.0f} m"
                          f"{'' if config.plane else ', off the ground'}), but the network needs "
                          f"{config.sa1.n_fps}; are the coordinates in metres?")
@@ -388,53 +388,55 @@ class UnweightedLoss(nn.Module):
 
 
 def move_scans(scans, T):
-    """Apply rigid motions or mirrors T (C,4,4) to the points of the records of C scans.
+    """Apply rigid motions or mirrors T (C,4,4) to the points in the records of C scans.
 
     Distances do not change, so sampling and grouping stay valid.
     """
     moved, T = scans.copy(), T.astype(np.float32)
     R_T, t = T[:, :3, :3].transpose(0, 2, 1), T[:, None, :3, 3]
-    moved["xyz"] = scans["xyz"] @ R_T + t  # R x + t for points that are rows
+    moved["xyz"] = scans["xyz"] @ R_T + t  # R x + t, with points as rows
     offsets = scans["group_sa1"][..., 1:]  # (C,n1,k1,3)
     moved["group_sa1"][..., 1:] = (offsets.reshape(len(T), -1, 3) @ R_T).reshape(offsets.shape)
     return moved
 
 
-ALIGNED = 1 / 3  # share of the augmented pairs that look as they do in refinement
+ALIGNED = 1 / 3  # with augmentation, the share of pairs in which Q is first aligned with P
 KEYFRAME_DISTANCE, KEYFRAME_ANGLE = 5.0, 20.0  # [m], [deg] at which refinement takes a new keyframe
 
 
 def augment(scans, T_pq, aligned, rng):
     """Mirror half of the pairs left to right, then move every Q by a small random motion.
 
-    Records of scans (2n,), all P and then all Q, and poses T_pq (n,4,4) -> the changed ones. Pairs
-    for which `aligned` (n,) is true are aligned first, and then moved less. If A is the motion that
-    moves a point q of the mirrored Q to A q, the new pose is T_pq A^-1. Not in the paper.
+    Takes the records of n scans P, then of their n scans Q, (2n,), and T_pq (n,4,4). Returns both
+    after augmentation. Where `aligned` (n,) is true, Q is first aligned with P by T_pq, and the
+    random motion is smaller. A motion A that takes each point q of Q to A q turns T_pq into
+    T_pq A^-1. Not in the paper.
     """
     n = len(T_pq)
     mirror = np.where(rng.random((n, 1, 1)) < 0.5, np.diag([1.0, -1, 1, 1]), np.eye(4))
     T_pq = mirror @ T_pq @ mirror
     scale = [0.25, 0.1, 0.03, 0.1, 0.1, 1.0]  # m, degrees; most in yaw: turns are rare
-    size = np.where(aligned, rng.random(n), 1.0)  # small ones, too, as left by earlier passes
+    size = np.where(aligned, rng.random(n), 1.0)  # smaller if aligned, like residuals in refinement
     small = from_vector(rng.normal(size=(n, 6)) * scale * size[:, None])
     A = small @ np.where(aligned[:, None, None], T_pq, np.eye(4))
     return move_scans(scans, np.concatenate([mirror, A @ mirror])), T_pq @ invert(A)
 
 
 def later_scan(motions, i, rng):
-    """Draw the number of a scan that is up to KEYFRAME_DISTANCE metres farther along the path.
+    """Draw the index of a scan up to KEYFRAME_DISTANCE metres farther along the path than scan i.
 
-    motions: T_{t,t+1} (n-1,4,4) of the sequence. It is the next scan, i + 1, if no other is near.
+    motions: T_{t,t+1} (n-1,4,4) of the sequence. The result is at least i + 1, even if that scan is
+    farther.
     """
     ahead = np.cumsum(np.linalg.norm(motions[i:, :3, 3], axis=1))  # distance to i+1, i+2, ... [m]
     return i + max(1, np.searchsorted(ahead, rng.uniform(0, KEYFRAME_DISTANCE), "right"))
 
 
 def training_batch(geometry, motions, pairs, config, rng, device="cpu"):
-    """Pairs (n,2) of (sequence, scan) -> Batch and the poses T_pq (B,4,4) of its pairs.
+    """`pairs` (n,2), each a sequence index s and a scan index i -> Batch and its T_pq (B,4,4).
 
-    P is that scan and Q the next one. With augmentation, some pairs are like those in refinement: Q
-    may be several scans later, and is aligned with P up to a small motion.
+    P is scan i and Q scan i + 1. With augmentation, some pairs imitate refinement: Q may be several
+    scans later, and is aligned with P up to a small motion.
     """
     n = len(pairs)
     aligned = rng.random(n) < ALIGNED if config.augment else np.zeros(n, bool)
@@ -457,8 +459,9 @@ def training_batch(geometry, motions, pairs, config, rng, device="cpu"):
 def steps_per_epoch(motions, config):
     """Number of batches in an epoch, in which every pair occurs once.
 
-    A batch has `config.batch` pairs or more, but fewer than twice as many. Raises ValueError if it
-    would hold only one direction of one pair, which has no batch statistics.
+    A batch has `config.batch` pairs or more, but fewer than twice as many. If there are fewer pairs
+    in all, they form one batch. Raises ValueError if a batch would hold one pair in one direction:
+    the final MLP sees one row per pair, so batch normalisation would have no statistics.
     """
     pairs = sum(map(len, motions))
     if config.swap == "random" and min(pairs, config.batch) < 2:
@@ -468,7 +471,7 @@ def steps_per_epoch(motions, config):
 
 
 def batches(geometry, motions, config, seed, start, stop, device="cpu"):
-    """Yield training batches `start` to `stop` - 1, preparing each while the last one is in use.
+    """Yield training batches `start` to `stop` - 1. A thread prepares the next one meanwhile.
 
     A batch depends only on `seed` (a tuple) and its number, so an interrupted training run
     continues with the batches it would have seen.
@@ -480,7 +483,8 @@ def batches(geometry, motions, config, seed, start, stop, device="cpu"):
         epoch, part = divmod(step, per_epoch)
         order = np.random.default_rng([*seed, epoch]).permutation(len(pairs))
         chosen = np.array_split(order, per_epoch)[part]  # parts of nearly equal size
-        rng = np.random.default_rng([*seed, epoch, part + 1])  # a trailing 0 repeats order's seed
+        # part + 1, since NumPy treats the seeds [*seed, epoch] and [*seed, epoch, 0] alike
+        rng = np.random.default_rng([*seed, epoch, part + 1])
         return training_batch(geometry, motions, pairs[chosen], config, rng, device)
 
     with ThreadPoolExecutor(1) as thread:
@@ -569,7 +573,7 @@ class Training:
         self.between_steps = True
 
     def eval_copies(self):
-        """Copy the network for use, in eval mode. Returns the copy and its form for the device.
+        """Copy the network for inference, in eval mode. Returns the copy and its `for_device` form.
 
         BatchNorm's running statistics lag behind the weights, so they are recomputed. If they were
         fixed, they are kept, since the weights were trained with them. Raises FloatingPointError if
@@ -580,7 +584,7 @@ class Training:
         if self.step <= self.frozen_from:
             update_bn(self.bn_batches(), model)
         total = sum(tensor.double().sum().item() for tensor in net.state_dict().values())
-        require_finite(total, "a weight")
+        require_finite(total, "a weight or BatchNorm statistic")
         return net.eval(), model.eval()
 
     def learning_rate(self):
@@ -653,7 +657,7 @@ def mean_loss(net, objective, examples):
     return np.mean(losses)
 
 
-def held_out_examples(geometry, motions, config, device):
+def test_examples(geometry, motions, config, device):
     """Yield (Batch, T) of 500 pairs spread evenly over sequences, or of all if there are fewer."""
     pairs = [(s, i) for s, T in enumerate(motions) for i in range(len(T))]
     chosen = np.unique(np.linspace(0, len(pairs) - 1, 500).astype(int))
@@ -665,7 +669,7 @@ def held_out_examples(geometry, motions, config, device):
 
 def fit(net, geometry, motions, run, seed=0, device="cpu", checkpoint=None, say=print,
         objective=None, test=None, **facts):
-    """Train `net` as `net.config` says (section 4). Returns a copy of it for use.
+    """Train `net` in place as `net.config` says (section 4). Returns a copy for inference.
 
     geometry, motions, run, objective, facts: see `Training`.
     seed: random seed for pair order and augmentation.
@@ -675,8 +679,8 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", checkpoint=None, say=
         used for nothing else.
 
     Every STORE_EVERY seconds and at the end, RUN/checkpoint.pt and RUN/weights.pt are written.
-    Ctrl-C lets the current step finish. Raises ValueError if the loss is not finite; nothing is
-    stored then.
+    Ctrl-C lets the current step finish. Raises ValueError if the loss, a weight or a statistic is
+    not finite; nothing further is stored then.
     """
     facts = facts or training_facts({}, motions, geometry)
     training = Training(net, geometry, motions, run, seed, device, objective, **facts)
@@ -693,7 +697,7 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", checkpoint=None, say=
                 line = f"epoch {epoch}/{net.config.epochs}: loss {loss:.4f}"
                 if test:
                     _, model = training.eval_copies()
-                    examples = held_out_examples(*test, net.config, device)
+                    examples = test_examples(*test, net.config, device)
                     line += f", test loss {mean_loss(model, training.objective, examples):.4f}"
                 say(f"{line}, learning rate {rate:.1e}")
             if interrupted:
@@ -765,8 +769,8 @@ def load_weights(path: str | Path | None = None, network=D3DLO, checkpoint: bool
             raise ValueError("damaged")
     except Exception as error:  # torch and pickle raise many exception types for a bad file
         reason = f"{type(error).__name__}: {error}".splitlines()[-1].strip()
-        raise ValueError(f"{path}: not a weights file of D3DLO ({reason:.120}); give a weights.pt "
-                         "or the folder of a training run") from None
+        raise ValueError(f"{path}: cannot be read as D3DLO weights ({reason:.120}); give a "
+                         "weights.pt or the folder of a training run") from None
     if checkpoint and "losses" not in state:
         raise ValueError(f"{path}: holds weights, but no training run to continue")
     if not checkpoint and "losses" in state:
@@ -788,7 +792,7 @@ def check_device(device):
 
 
 def for_device(net, device):
-    """The form of a network that runs on a device: `fast` on a CPU, elsewhere the plain one."""
+    """The version of a network to run on a device: `fast` on a CPU, the plain one elsewhere."""
     return fast(net) if torch.device(device).type == "cpu" else net.to(device)
 
 
@@ -841,37 +845,38 @@ def predict(net, scans, p, q, device):
     return net.decode(y_hat)
 
 
-def mean_motion(motions):
-    """Similar rigid motions (n,4,4) -> their mean (4,4), which is rigid again."""
-    motions = np.stack(motions)
+def mean_transform(transforms):
+    """Similar rigid transforms (n,4,4) -> their mean (4,4), also rigid."""
+    transforms = np.stack(transforms)
     T = np.eye(4)
-    T[:3, :3] = Rotation.from_matrix(motions[:, :3, :3]).mean().as_matrix()
-    T[:3, 3] = motions[:, :3, 3].mean(0)
+    T[:3, :3] = Rotation.from_matrix(transforms[:, :3, :3]).mean().as_matrix()
+    T[:3, 3] = transforms[:, :3, 3].mean(0)
     return T
 
 
-def predict_refined(net, keyframe, scan, guess, device):
-    """n samplings of P and of Q, records (n,) each, and a guess of T_pq -> T_pq (4,4).
+def predict_refined(net, samplings_p, samplings_q, guess, device):
+    """Refine a guess of T_pq (4,4) with n samplings each of P and Q, records (n,) -> T_pq (4,4).
 
-    There is one pass for each sampling. It aligns Q with the estimate so far, predicts the residual
+    Each pass uses one sampling. It aligns Q with P by the current estimate, predicts the residual
     motion in both directions, and updates the estimate. The result is the mean of all n estimates,
     because most of their error depends on which points were sampled. Not in the paper.
     """
     T, estimates = guess, []
-    for p, q in zip(keyframe, scan):
+    for p, q in zip(samplings_p, samplings_q):
         aligned, = move_scans(q[None], T[None])
         pair = np.stack([p, aligned])
         T_pq, T_qp = predict(net, pair, np.array([0, 1]), np.array([1, 0]), device)
-        T = mean_motion([T_pq, invert(T_qp)]) @ T
+        T = mean_transform([T_pq, invert(T_qp)]) @ T
         estimates.append(T)
-    return mean_motion(estimates)
+    return mean_transform(estimates)
 
 
 def several_samplings(scan, config, n):
     """Sample a scan n times: (N,4) -> records (n,), see `scan_geometry`. Not in the paper.
 
-    Sampling k takes its centroids from points k, k + n, k + 2n, ..., so that no two samplings share
-    a centroid, unless there are too few points. Neighbours are searched in the whole scan.
+    Sampling k takes its centroids from points k, k + n, k + 2n, ..., so no two samplings share a
+    centroid. A scan with fewer than n * n1 usable points is split into fewer parts, so some
+    samplings are then identical. Neighbours are searched in the whole scan.
     """
     scan, broken = usable_scan(scan, config)
     cloud = np.ascontiguousarray(scan[:, :3])
@@ -880,7 +885,7 @@ def several_samplings(scan, config, n):
     clouds = cloud[:size * parts].reshape(size, parts, 3).swapaxes(0, 1)  # (parts,size,3)
     with ThreadPoolExecutor(2) as threads:
         tree = threads.submit(build_tree, cloud)  # while the main thread samples
-        centroids = farthest_point_samplings(clouds, config.sa1.n_fps) * parts  # (parts,n1)
+        centroids = batched_fps(clouds, config.sa1.n_fps) * parts  # (parts,n1)
         centroids += np.arange(parts)[:, None]
 
         def group(k):
@@ -899,8 +904,8 @@ def predict_motions(net, records, device="cpu", batch=16):
     return np.concatenate(motions)
 
 
-BROKEN = "invalid points (not finite, or range or intensity out of bounds)"
-UNLIKE = "scans look unlike the training data; the poses may be wrong"
+INVALID_POINTS = "invalid points (not finite, or range or intensity out of bounds)"
+SHIFT_WARNING = "scans look unlike the training data; the poses may be wrong"
 
 
 class Odometry:
@@ -932,15 +937,16 @@ class Odometry:
     def register(self, scan: np.ndarray) -> np.ndarray:
         """Scan (N,4): x, y, z [m], intensity 0 to 1 -> its pose T_0t (4,4), Velodyne frame.
 
-        The first pose is the identity. Warns about invalid points, and about scans unlike those in
-        training. Raises ValueError if the scan cannot be used; the state is then unchanged.
+        The first pose is the identity. Warns about invalid points and, once, about scans unlike
+        those in training. Raises ValueError if the scan cannot be used; the state is then
+        unchanged.
         """
         records = several_samplings(scan, self.net.config, max(self.refine, 1))
         if records[0]["broken"]:
-            warnings.warn(f"dropped {records[0]['broken']} {BROKEN}", stacklevel=2)
+            warnings.warn(f"dropped {records[0]['broken']} {INVALID_POINTS}", stacklevel=2)
         pose = self.register_records(records)
         if self.seen and (shift := kitti.domain_shift(records[0]["stats"], self.seen)):
-            warnings.warn(f"{UNLIKE}: {shift}", stacklevel=2)
+            warnings.warn(f"{SHIFT_WARNING}: {shift}", stacklevel=2)
             self.seen = None  # warn once
         return pose
 
@@ -991,7 +997,7 @@ def load_geometry(sequences, config, cache="cache"):
     """Compute `scan_geometry` of all scans of the sequences, or read it from the folder `cache`.
 
     Returns two lists with an entry for each sequence: records (n,), and a fingerprint of the data.
-    Raises ValueError, naming the file, for a scan that `scan_geometry` refuses.
+    Raises ValueError, naming the file, for a scan that `scan_geometry` rejects.
     """
     compute = functools.partial(scan_geometry, config=config)
     dtype = geometry_dtype(config)
@@ -1000,7 +1006,7 @@ def load_geometry(sequences, config, cache="cache"):
     geometry, crcs = kitti.cached_records(sequences, compute, dtype, depends, cache)
     for s, records in zip(sequences, geometry):
         if (broken := records["broken"]).any():
-            print(f"sequence {s.name}: dropped {broken.sum()} {BROKEN} in "
+            print(f"sequence {s.name}: dropped {broken.sum()} {INVALID_POINTS} in "
                   f"{np.count_nonzero(broken)} of {len(s)} scans", file=sys.stderr)
     return geometry, [kitti.fingerprint(s, crc) for s, crc in zip(sequences, crcs)]
 
@@ -1010,7 +1016,7 @@ def warn_about_shift(s, records, seen):
     shifts = [kitti.domain_shift(stats, seen) for stats in records["stats"]]
     shifts = [shift for shift in shifts if shift]
     if shifts:
-        print(f"sequence {s.name}: {len(shifts)} of {len(s)} {UNLIKE}: {shifts[0]}",
+        print(f"sequence {s.name}: {len(shifts)} of {len(s)} {SHIFT_WARNING}: {shifts[0]}",
               file=sys.stderr)
 
 
@@ -1033,8 +1039,8 @@ def predict_poses(odometry, s, records):
 def evaluate_sequence(odometry, s, records, out):
     """Predict the trajectory of a sequence and write OUT/NN.txt, a KITTI pose file.
 
-    Returns {predictor: (segment errors, step errors)} for the network and the BASELINES, which is
-    empty without ground truth.
+    Returns {predictor: (segment errors, step errors)} for the network and the BASELINES, or {}
+    without ground truth.
     """
     poses = predict_poses(odometry, s, records)
     metrics.write_poses(out / f"{s.name}.txt", kitti.velo_to_camera(poses, s.Tr))
@@ -1081,7 +1087,7 @@ def evaluate_folder(odometry, s, out, plot=False, say=print):
     if plot:
         metrics.draw(out / "plot.png", {s.name: (None, poses)})
         files.append("plot.png")
-        lines.append(f"picture       {out}/plot.png (from above)")
+        lines.append(f"plot          {out}/plot.png (from above)")
     source = {"data": str(s.folder), "refine": odometry.refine, "files": files}
     metrics.write_json(out / "results.json", source | {"path_m": length, "scans": len(s)})
     say("\n".join(lines))
@@ -1089,7 +1095,7 @@ def evaluate_folder(odometry, s, out, plot=False, say=print):
 
 
 def summarize(errors, trained_on):
-    """Average the errors of all sequences, splits and lengths, as results.json holds them.
+    """Average the errors per sequence, split and segment length, in the layout of results.json.
 
     errors: {sequence: result of `evaluate_sequence`}; trained_on: {sequence: bool}.
     """
@@ -1119,8 +1125,8 @@ def results_table(results):
     rows += [metrics.row(length, s) for length, s in results["lengths"].items()]
     return (metrics.table(metrics.HEADER, rows) + "\n"
             "*: trained on. E_t, E_r: KITTI's segments of 100 to 800 m, rectified left camera "
-            "frame. t step, r step: mean length and\nangle of inv(T_est) @ T_true of a step, "
-            "Velodyne frame. -: no such segment, or no ground truth.")
+            "frame. t step, r step: mean\ntranslation and rotation of inv(T_est) @ T_true of a "
+            "step, Velodyne frame. -: no such segment, or no ground truth.")
 
 
 def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", refine=0, plot=False,
@@ -1143,10 +1149,10 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     """
     odometry = Odometry(weights, device, refine, network)
     if plot:
-        metrics.picture(1, 1)  # without matplotlib, fail now and not after the work
+        metrics.new_figure(1, 1)  # without matplotlib, fail now and not after the work
     sequences = sequences or ("all" if data else ("test", "validation"))
     root = data_root(data, sequences)
-    out = kitti.new_name("results") if out is None else Path(out)
+    out = kitti.unused_path("results") if out is None else Path(out)
     check_output(out, root)
     chosen = kitti.open_sequences(root, sequences)
     if isinstance(chosen[0], kitti.ScanFolder):
@@ -1155,14 +1161,14 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     results = evaluate_sequences(odometry, chosen, out)
     files = [f"{s.name}.txt" for s in chosen]
     lines = [f"trajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)",
-             f"figures       {out}/results.json"]
+             f"errors        {out}/results.json"]
     if {f"{i}.txt" for i in range(11, 22)} <= set(files):  # KITTI's sequences without ground truth
         lines.append(f"to submit     {zip_for_server(out)}")
         files.append("kitti-server.zip")
     if plot:
         T = {s.name: (s.poses_cam, metrics.read_poses(out / f"{s.name}.txt")) for s in chosen}
         metrics.draw(out / "plot.png", T)
-        lines.append(f"picture       {out}/plot.png (from above, errors by length)")
+        lines.append(f"plot          {out}/plot.png (from above, errors by length)")
         files.append("plot.png")
     source = {"weights": str(weights or PRETRAINED), "data": str(root), "refine": refine}
     metrics.write_json(out / "results.json", source | results | {"files": files})
@@ -1171,7 +1177,7 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
 
 
 def clear_results(out):
-    """Delete the files of an earlier evaluation in the folder OUT, which its results.json lists."""
+    """Delete what an earlier evaluation wrote to OUT, as listed in OUT/results.json."""
     try:
         content = json.loads((out / "results.json").read_text(encoding="utf-8"))
         files = [Path(name) for name in content["files"]]
@@ -1199,7 +1205,7 @@ def zip_for_server(out):
 # goes into memory traffic, so these functions avoid large arrays.
 
 CHUNK = 192  # points in a chunk; 128 to 256 are about as fast
-# A byte with its bits spread out to every second place: its binary digits, read in base 4
+# SPREAD_BITS[i]: byte i with its bits at every second position (its binary digits read in base 4)
 SPREAD_BITS = np.array([int(f"{i:b}", 4) for i in range(256)], np.uint16)
 
 
@@ -1236,13 +1242,13 @@ def farthest_point_sampling(xyz: np.ndarray, n: int, start: int = 0) -> np.ndarr
 
     The cloud is cut into chunks of neighbouring points. A new centroid can only shorten distances
     in chunks whose bounding box is nearer to it than their largest `min_dist`; all other chunks
-    are skipped. The result is nested: the first m of n indices are those of n = m. Raises
+    are skipped. The result is nested: its first m indices are the result for n = m. Raises
     ValueError unless 0 < n <= N and 0 <= start < N.
     """
     xyz = np.asarray(xyz)
     if not (0 < n <= len(xyz) and 0 <= start < len(xyz)):
-        raise ValueError(f"farthest point sampling of {n} among {len(xyz)} points from {start}: n "
-                         f"must be 1 to {len(xyz)}, start below that")
+        raise ValueError(f"farthest point sampling of {n} of {len(xyz)} points from index {start}: "
+                         f"needs 1 <= n <= {len(xyz)} and 0 <= start < {len(xyz)}")
     xyz = np.asarray(xyz, np.float32 if xyz.dtype == np.float32 else np.float64)
     order, points, low, high = cut_into_chunks(xyz)
     min_dist = np.full(order.shape, np.inf, xyz.dtype)  # (chunks,CHUNK), squared
@@ -1256,7 +1262,7 @@ def farthest_point_sampling(xyz: np.ndarray, n: int, start: int = 0) -> np.ndarr
         gap *= gap
         near = (np.add.reduce(gap, 0) < largest).nonzero()[0]
         # Update the squared distances in these chunks
-        d = points.take(near, 0)  # (near,3,CHUNK); summed in the same order as the gap
+        d = points.take(near, 0)  # (near,3,CHUNK); summed in the same order as gap: same rounding
         d -= p
         d *= d
         d = np.minimum(np.add.reduce(d, 1), min_dist.take(near, 0))
@@ -1269,8 +1275,8 @@ def farthest_point_sampling(xyz: np.ndarray, n: int, start: int = 0) -> np.ndarr
     return centroids
 
 
-def farthest_point_samplings(clouds, n):
-    """`farthest_point_sampling` of K clouds at a time: (K,N,3) -> indices (K,n), the first 0.
+def batched_fps(clouds, n):
+    """`farthest_point_sampling` of K clouds in one loop: (K,N,3) -> (K,n) indices, from index 0.
 
     For small clouds most of the time is NumPy's overhead, which one loop for all clouds shares.
     """
@@ -1400,7 +1406,7 @@ class GatherAdd(torch.autograd.Function):
 class LinearMax(torch.autograd.Function):
     """h (B,S,k,D), W (D',D) -> the maximum over k of h W^T, (B,S,D').
 
-    With `moments`, also returns E[h] (D,) and E[h^T h] (D,D) over all B S k rows, otherwise None.
+    With `moments`, also returns E[h] (D,) and E[h^T h] (D,D) over all B S k rows; without, None.
     The product is computed for one element of the batch at a time, so that (B,S,k,D') never exists
     in full. The backward pass computes it again. Equal maxima share the gradient, as in torch.amax.
     """
@@ -1431,9 +1437,9 @@ class LinearMax(torch.autograd.Function):
         for b, rows in enumerate(h.reshape(B, S * k, D)):
             # The product, as in the forward pass
             torch.mm(rows, W.t(), out=z)
-            # In its place the mask of the maxima: 1 for each maximum over k, otherwise 0
+            # Overwrite it with the mask of the maxima: 1 for each maximum over k, otherwise 0
             torch.eq(z_by_group, z_by_group.amax(1, keepdim=True), out=z_by_group)
-            # In its place the gradient of the product: equal maxima get equal shares
+            # Overwrite the mask with the gradient of the product: equal maxima get equal shares
             z_by_group.mul_((grad[b] / z_by_group.sum(1).clamp_(min=1))[:, None])
             # The gradients of W and h
             grad_W.addmm_(z.t(), rows)
@@ -1448,10 +1454,10 @@ class LinearMax(torch.autograd.Function):
 def linear_norm_relu_max(linear, norm, h):
     """The maximum over k of ReLU(BN(linear(h))): h (B,...,k,D) -> (B,...,D').
 
-    ReLU never decreases. BN increases where its scale is positive and decreases where it is
-    negative. So the maximum can be taken first: of z = W h + b where the scale is positive, and of
-    -z where it is negative. BN's statistics are still those of all neighbours. They follow from the
-    moments of h: mean = W E[h] + b, var = diag(W Cov[h] W^T).
+    ReLU is non-decreasing. BN is increasing in channels with a positive scale and decreasing in
+    channels with a negative one. So the maximum can be taken first: of z = W h + b where the scale
+    is positive, and of -z where it is negative. BN's statistics are still those of all neighbours.
+    They follow from the moments of h: mean = W E[h] + b, var = diag(W Cov[h] W^T).
     """
     sign = torch.where(norm.weight < 0, -1.0, 1.0).to(h)
     W, b = sign[:, None] * linear.weight, sign * linear.bias
@@ -1550,7 +1556,7 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     """
     check_device(device)
     check_number("seed", seed)
-    run = kitti.new_name("runs") if out is None else Path(out)
+    run = kitti.unused_path("runs") if out is None else Path(out)
     check_output(run, data or SIMULATED)
     with kitti.run_folder(run):
         if resume:
@@ -1592,8 +1598,8 @@ def training_geometry(chosen, held_out, config):
     """Load the records of the sequences to train on, and the data for the test loss.
 
     Returns a list of records (n,), {name: fingerprint of the data}, and geometry and motions of the
-    test split's sequences, () without any. The scans of all held-out sequences are read, so that an
-    unusable one is found now and not after the training.
+    test split's sequences, or () if there are none. The scans of all held-out sequences are read,
+    so that an unusable one is found now and not after the training.
     """
     geometry, fingerprints = load_geometry(chosen + held_out, config)
     test = [(records, s.motions()) for records, s in zip(geometry[len(chosen):], held_out)
@@ -1613,7 +1619,7 @@ def evaluate_held_out(root, run, held_out, device, say, network):
 
 def print_and_log(log, line):
     """Print a line and append it to a log file."""
-    with metrics.naming(log), open(log, "a", encoding="utf-8") as file:
+    with metrics.add_path_to_oserror(log), open(log, "a", encoding="utf-8") as file:
         file.write(line + "\n")
     print(line, flush=True)
 
@@ -1622,7 +1628,7 @@ def starting_point(run, resume, weights, config, network, seed):
     """What training starts from: the run's checkpoint, other weights, or random weights.
 
     Returns the network, the content of the checkpoint or None, and what `training_facts` must know
-    about earlier training data. The network of other weights keeps its input settings.
+    about earlier training data. With other weights, the input settings stored in them are kept.
     """
     stored = run / "checkpoint.pt"
     if resume and stored.exists():
@@ -1680,7 +1686,7 @@ def read_run(run):
 def command_line(argv):
     """Parse the arguments. Returns {option: value} of the options given.
 
-    `train` and `evaluate` hold the defaults of all others.
+    The signatures of `train` and `evaluate` hold the defaults of all other options.
     """
     settings = dict(formatter_class=argparse.RawDescriptionHelpFormatter,
                     argument_default=argparse.SUPPRESS)
@@ -1710,7 +1716,7 @@ def command_line(argv):
 
 
 def data_options(command, layouts, default):
-    """Add the options of both commands. default: a description of that of --sequences."""
+    """Add the options of both commands. default: text on the default of --sequences, for --help."""
     add = command.add_argument_group("data").add_argument
     add("--data", metavar="ROOT", help=(
         f"{layouts} (default: a simulated city, made in {SIMULATED})"))
@@ -1725,7 +1731,7 @@ def train_options(command):
     add("--weights", metavar="FILE|RUN", help=(
         "start from these weights and keep their network and input settings"))
     add("--neighbors", type=int, metavar="N", help=(
-        f"n_n of the first set abstraction, Table 2 (default: {Config.sa1.n_n})"))
+        f"neighbours in the first set abstraction, n_n in Table 2 (default: {Config.sa1.n_n})"))
     add("--no-plane", action="store_false", dest="plane", help=(
         "remove the points of the ground plane, Table 2"))
     add = command.add_argument_group("training").add_argument
@@ -1734,7 +1740,7 @@ def train_options(command):
         "directions, Muon, one-cycle learning rate, augmentation, fixed BatchNorm statistics at "
         "the end"))
     add("--epochs", type=int, metavar="N", help=(
-        f"default: {Config.epochs}; with --short {SHORT['epochs']}"))
+        f"number of epochs (default: {Config.epochs}; with --short {SHORT['epochs']})"))
     add("--batch", type=int, metavar="N", help=(
         f"pairs in a batch (default: {Config.batch}; with --short {SHORT['batch']})"))
     add("--lr", type=float, metavar="X", help=(
@@ -1786,7 +1792,7 @@ def main(argv=None):
     """Run the command line. Returns the exit code: 0, 2 for bad input, 130 when interrupted."""
     args = command_line(argv)
     kitti.keep_freed_memory()
-    kitti.terminate_as_interrupted()
+    kitti.treat_sigterm_as_interrupt()
     try:
         if args.pop("command") == "eval":
             evaluate(**args)

@@ -6,10 +6,10 @@ intensity [0..1]. `T_ab` maps points from frame b to frame a.
 KITTI's pose files are in the frame of the rectified left camera. The points are in the Velodyne
 frame, so `poses` and `motions()` of a sequence are, too: T_velo = inv(Tr) @ T_cam @ Tr.
 
-The simulated city can be used in place of KITTI. An HDL-64E drives through 11 small cities, in
-traffic that moves with it, towards it and across its way, on streets with queues at lights, on
-roundabouts, ramps and motorways. The ground truth is exact: 2,620 scans, 4.2 GB. Needs NumPy and
-SciPy.
+The simulated city can be used in place of KITTI: a car with an HDL-64E drives through 11 small
+cities, one for each sequence. There is oncoming, cross and same-direction traffic, and there are
+queues at lights, roundabouts, ramps and motorways. The ground truth is exact. All 11 sequences have
+2,620 scans and take 4.2 GB. Needs NumPy and SciPy.
 
     python kitti.py simulate data/city
     python kitti.py simulate data/tiny --sequences 00 07 --scans 40 --azimuth 900
@@ -121,7 +121,7 @@ def read_calib(path: str | Path) -> np.ndarray:
 
     Returns T_cam0_velo (4,4) float64, which maps points from the Velodyne frame to the frame of the
     rectified left camera [m]. Raises FileNotFoundError if there is no such file, and ValueError if
-    `Tr` is missing or is not 12 finite numbers with a rotation.
+    `Tr` is missing or is not a finite rigid transform of 12 numbers.
     """
     path = Path(path)
     remedy = ("KITTI's is in data_odometry_calib.zip; for drives of your own write the line "
@@ -318,7 +318,7 @@ class ScanFolder(Sequence):
             self.times = _read_times(self.folder / "times.txt", len(self))
         else:
             self.times = 0.1 * np.arange(len(self))
-            self.notes.append("there is no times.txt, one time in seconds per line; "
+            self.notes.append("no times.txt (one time in seconds per line); "
                               "10 scans a second are assumed")
 
 
@@ -401,8 +401,8 @@ def open_sequences(root: str | Path, names: str | list[str] | None = None) -> li
     """Open sequences of ROOT, in the order given, each once.
 
     names: one or several names of folders under ROOT/sequences, splits of SPLITS, or "all"; None
-    means "all". Of a split, the sequences that ROOT has are opened. A ROOT without a folder
-    sequences/ is one `ScanFolder`. Raises ValueError for a name or split of which ROOT has nothing,
+    means "all". Sequences of a split that ROOT lacks are skipped. A ROOT without a folder
+    sequences/ is one `ScanFolder`. Raises ValueError for a name or split with no sequence in ROOT,
     and the errors of `sequence_names`, `Sequence` and `ScanFolder`.
     """
     available = sequence_names(root)
@@ -432,7 +432,7 @@ def open_sequences(root: str | Path, names: str | list[str] | None = None) -> li
 # ------------------------------------------------------------------------------------------------
 # From a scan to a point cloud
 
-BROKEN_RANGE, BROKEN_INTENSITY = 1000.0, 65536  # [m]; no LiDAR returns more
+MAX_VALID_RANGE, MAX_VALID_INTENSITY = 1000.0, 65536  # the first in m; no LiDAR returns more
 # Scan statistics, used to warn about domain shift
 STATS = ("usable points", "mean intensity", "median range of the centroids [m]",
          "share of points in the densest 0.3 m of height (the ground)")
@@ -443,8 +443,8 @@ def usable_points(scan, max_range=None, plane=True):
 
     (N,4) -> (M,4) float32, in the same order, and a number. Invalid points are dropped first: those
     that are not finite, or whose range or intensity is too large for a LiDAR. Then points beyond
-    `max_range` metres are dropped (None: keep all) and, unless `plane`, the ground plane. Raises
-    ValueError for a shape other than (N,4).
+    `max_range` metres are dropped (None: keep all). If `plane` is False, the ground plane is
+    removed last. Raises ValueError for a shape other than (N,4).
     """
     with np.errstate(over="ignore", invalid="ignore"):
         scan = np.asarray(scan, np.float32)
@@ -454,9 +454,9 @@ def usable_points(scan, max_range=None, plane=True):
         x, y, z, intensity = scan.T  # (N,) each
         squared_range = x * x + y * y + z * z
         # A comparison with NaN is false
-        in_range = squared_range < BROKEN_RANGE**2
-        intact = in_range & (np.abs(intensity) < BROKEN_INTENSITY)
-        near = squared_range < (max_range or BROKEN_RANGE) ** 2
+        in_range = squared_range < MAX_VALID_RANGE**2
+        intact = in_range & (np.abs(intensity) < MAX_VALID_INTENSITY)
+        near = squared_range < (max_range or MAX_VALID_RANGE) ** 2
     broken = np.count_nonzero(~intact)
     kept = scan[intact & near]  # (M,4)
     if not plane:
@@ -558,8 +558,8 @@ def _plane_inliers(xyz, n, d, threshold):
 def progress(items, total, what):
     """Yield the items and report on stderr: how many of `total` are done, the rate, the time left.
 
-    On a terminal the line is rewritten in place. Elsewhere a line is printed every 10 s or, if that
-    is longer, after another tenth of the elapsed time.
+    On a terminal the line is rewritten in place. Elsewhere a line is printed every 10 s at first,
+    and then at intervals of a tenth of the elapsed time.
     """
     tty = sys.stderr.isatty()
     began, done = time.monotonic(), 0
@@ -605,9 +605,9 @@ def in_processes(function, tasks, workers=None, chunksize=4):
     try:
         yield from pool.map(function, tasks, chunksize=chunksize)
     except BrokenExecutor:
-        raise OSError("a worker process died. Where processes are spawned, as on macOS and "
-                      "Windows, a script needs the line if __name__ == '__main__': before its main "
-                      "part. Otherwise check the free memory") from None
+        raise OSError("a worker process died. Where processes are not forked (macOS, Windows, and "
+                      "Linux from Python 3.14), a script needs the line if __name__ == '__main__': "
+                      "before its main part. Otherwise check the free memory") from None
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -618,7 +618,7 @@ def _leave_signals_to_parent():
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
-def terminate_as_interrupted():
+def treat_sigterm_as_interrupt():
     """Treat SIGTERM like Ctrl-C from now on, so that every `finally` runs."""
     if threading.current_thread() is threading.main_thread():  # only it may set handlers
         signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -649,7 +649,7 @@ def versions(folder):
     return {"commit": commit, "python": platform.python_version(), **packages}
 
 
-def new_name(parent):
+def unused_path(parent):
     """A path PARENT/TIME that does not exist yet."""
     path = first = Path(parent) / time.strftime("%Y-%m-%d-%H%M%S")
     for i in itertools.count(2):
@@ -721,15 +721,15 @@ def delayed_interrupt():
 def cached_records(sequences, compute, dtype, settings, cache="cache"):
     """Compute a record for every scan and store it. Later calls read the stored records.
 
-    sequences: a list of `Sequence`; compute: a function from a scan (N,4) to a record of `dtype`,
-    which can be pickled; settings: everything else that the records depend on; cache: the folder of
-    the files. Returns two lists with an entry for each sequence: records (n,), memory-mapped, and
+    sequences: a list of `Sequence`; compute: a picklable function from a scan (N,4) to a record of
+    `dtype`; settings: everything else that the records depend on; cache: the folder of the files.
+    Returns two lists with an entry for each sequence: records (n,), memory-mapped, and
     the CRC-32 of every scan (n,) uint32, from which `fingerprint` identifies the data.
 
-    A file's name is a hash of the settings and of the folder and every scan's size and times, so a
+    A file's name contains a hash of the settings, the folder, and every scan's size and times, so a
     stale file is never read. A damaged file is computed again. Files are moved into place when they
     are complete, so two processes may share a cache. The work is spread over all cores. Raises
-    ValueError, naming the file, for a scan that `compute` refuses.
+    ValueError, naming the file, for a scan that `compute` rejects.
     """
     row_dtype = np.dtype([("record", dtype), ("scan_crc", "u4"), ("crc", "u4")])
     files = [Path(cache) / f"{s.name}-{_cache_key(s, settings, dtype)}.npy" for s in sequences]
@@ -821,7 +821,7 @@ EARTH_RADIUS = 6378137.0  # [m]; devkit: latlonToMercator.m
 LAT_LON_ALT = slice(0, 3)  # degrees, degrees, m
 ROLL_PITCH_YAW = slice(3, 6)  # rad
 VELOCITY = [7, 6, 10]  # m/s to the east, to the north and upwards
-TURN_RATE = slice(17, 20)  # rad/s about the unit's x, y and z axes
+ANGULAR_VELOCITY = slice(17, 20)  # rad/s about the unit's x, y and z axes
 MAX_DELAY = np.timedelta64(100, "ms")  # a scan farther from every packet has no pose
 SECOND = np.timedelta64(1, "s")
 
@@ -836,11 +836,12 @@ def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int
     at the gaps, into sequences whose names end with -1, -2 ... Returns {name of a sequence:
     (number of its first scan in the drive, of its last)}.
 
-    A pose is for the time in velodyne_points/timestamps.txt: the middle of the scanner's turn, when
-    it faces forward and triggers the cameras. The "sync" data is aligned to this time. The GPS/IMU
-    packet of a scan was recorded at another time, 12 to 25 ms later in drive 0013. So the pose of
-    the nearest packet is moved to the time of the scan by the packet's velocity and turn rate. The
-    points are not corrected for the motion during the 0.1 s of a turn.
+    A pose is that at the scan's time in velodyne_points/timestamps.txt: the middle of the
+    revolution, when the scanner faces forward and triggers the cameras. The "sync" data is aligned
+    to this time. The GPS/IMU packet of a scan was recorded at another time, 12 to 25 ms later in
+    drive 0013. So the pose of the nearest packet is extrapolated to the scan's time with the
+    packet's velocity and angular velocity. The points are not corrected for the motion during the
+    0.1 s of a revolution.
 
     Raises FileNotFoundError for a missing file, naming its archive, and ValueError for a damaged
     one or if ROOT holds such a sequence already. ROOT is then unchanged.
@@ -1001,7 +1002,8 @@ def _imu_poses(packets, nearest, delay):
     north = scale * np.log(np.tan(np.radians(90 + lat) / 2))
     position = np.stack([east, north, alt], axis=1)  # (n,3)
     attitude = Rotation.from_euler("xyz", packets[:, ROLL_PITCH_YAW])
-    turn = attitude.apply(packets[:, TURN_RATE]) * delay  # (n,3) rotation vectors, world's axes
+    # Rotation vectors along the axes of the world (n,3)
+    turn = attitude.apply(packets[:, ANGULAR_VELOCITY]) * delay
     half_turn = Rotation.from_rotvec(turn / 2)
     T = np.tile(np.eye(4), (len(packets), 1, 1))  # (n,4,4)
     T[:, :3, :3] = (Rotation.from_rotvec(turn) * attitude).as_matrix()
@@ -1974,7 +1976,7 @@ def _command_line(argv):
 def main(argv=None):
     """The command line -> exit code: 0, 2 for bad input, 130 when interrupted."""
     args = _command_line(argv)
-    terminate_as_interrupted()
+    treat_sigterm_as_interrupt()
     try:
         if args.command == "raw":
             parts = convert_raw(args.drive, args.dir)

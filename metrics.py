@@ -32,9 +32,9 @@ SEGMENT = np.dtype([
 ])
 HEADER = ["sequence", "segments", "E_t [%]", "E_r [deg/m]", "t step [m]", "r step [deg]"]
 UNITS = """\
-E_t, E_r: KITTI devkit, mean over segments of 100 to 800 m of path. t step, r step: mean error of a
-step. ATE, RPE: RMSE, as `evo_ape kitti` and `evo_rpe kitti` print it without options: no alignment,
-delta of one frame; degrees with -r angle_deg.
+E_t, E_r: KITTI devkit, mean over segments of 100 to 800 m of path. t step, r step: mean error per
+step. ATE, RPE: RMSE without alignment, RPE over one frame, as `evo_ape kitti` and `evo_rpe kitti`
+print by default; for RPE [deg] give evo_rpe -r angle_deg.
 All in the frame of the files; KITTI's is the rectified left camera."""
 
 # ------------------------------------------------------------------------------------------------
@@ -70,8 +70,8 @@ def _is_dead(process):
 
 
 @contextmanager
-def naming(path):
-    """Add the file's name to an OSError of the block that lacks it, such as for a full disk."""
+def add_path_to_oserror(path):
+    """Add the file name to an OSError of the block that has none, such as for a full disk."""
     try:
         yield
     except OSError as error:
@@ -93,7 +93,7 @@ def replacing(path):
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = temporary_beside(path)
     try:
-        with naming(path):
+        with add_path_to_oserror(path):
             yield temporary
             os.replace(temporary, path)
     finally:
@@ -198,7 +198,8 @@ def segment_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
     complete = last < len(path)
     first, last, length = first[complete], last[complete], length[complete]  # (segments,)
 
-    # The error is the inverse of the paper's, as in the devkit. Its length and angle are the same.
+    # Our error transform is the inverse of the paper's, as in the devkit. The norm of its
+    # translation and the angle of its rotation are the same.
     delta_gt = np.linalg.inv(T_gt[first]) @ T_gt[last]  # (segments,4,4)
     delta_est = np.linalg.inv(T_est[first]) @ T_est[last]  # (segments,4,4)
     error = np.linalg.inv(delta_est) @ delta_gt  # (segments,4,4)
@@ -227,7 +228,7 @@ def kitti_errors(segments: list[np.ndarray]) -> tuple[float, float]:
 def step_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
     """Error of every step from a frame to the next: evo's relative pose error with delta 1.
 
-    True and estimated poses (n,4,4) -> (n-1,2): length [m] and angle [deg] of
+    True and estimated poses (n,4,4) -> (n-1,2): translation [m] and rotation angle [deg] of
     inv(motion_est) @ motion_gt, in the frame of the poses. Raises ValueError if the shapes differ.
     """
     T_gt, T_est = _check_shapes(T_gt, T_est)
@@ -314,12 +315,12 @@ def row(name, s):
 # Pictures
 
 
-def picture(width, height):
+def new_figure(width, height):
     """An empty matplotlib figure of a size in inches. Raises ValueError without matplotlib."""
     try:
         from matplotlib.figure import Figure  # unlike pyplot, it needs no display
     except ImportError:
-        raise ValueError("a picture needs matplotlib: pip install \".[plot]\"") from None
+        raise ValueError("plotting needs matplotlib: pip install \".[plot]\"") from None
     return Figure(figsize=(width, height), layout="constrained")
 
 
@@ -347,7 +348,7 @@ def draw(path, trajectories):
     """
     any_truth = any(T_gt is not None for T_gt, _ in trajectories.values())
     columns = 3 if any_truth else 1
-    figure = picture(3.5 * columns, 3.1 * len(trajectories))
+    figure = new_figure(3.5 * columns, 3.1 * len(trajectories))
     rows = figure.subplots(len(trajectories), columns, squeeze=False)
     for (name, (T_gt, T_est)), (above, *errors) in zip(trajectories.items(), rows):
         _draw_paths(above, name, T_gt, T_est)

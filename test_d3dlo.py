@@ -218,7 +218,7 @@ def test_farthest_point_samplings_are_those_of_each_cloud(seed, K, N):
     clouds = np.stack([random_scan(rng, N)[:, :3] for _ in range(K)])
     clouds[0] = np.round(clouds[0] / 10)  # with many ties
     expected = [fps_textbook(xyz, 20) for xyz in clouds]
-    assert_array_equal(d3dlo.farthest_point_samplings(clouds, 20), expected)
+    assert_array_equal(d3dlo.batched_fps(clouds, 20), expected)
 
 
 @pytest.mark.parametrize("N, n", [(5, 6), (5, 0), (0, 1), (1023, 1024)])
@@ -933,7 +933,7 @@ def test_the_test_loss_uses_at_most_500_fixed_pairs_spread_over_all_sequences(n,
     def pairs(net):  # the "records" of scans are their numbers
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(d3dlo, "training_batch", lambda *arguments: (arguments[2], None))
-            parts = d3dlo.held_out_examples(None, [range(n), range(m)], SMALL, "cpu")
+            parts = d3dlo.test_examples(None, [range(n), range(m)], SMALL, "cpu")
             return [pair for part, _ in parts for pair in part]
 
     chosen = pairs(0)
@@ -1528,7 +1528,7 @@ def test_default_folder_names_made_in_the_same_second_differ(tmp_path, monkeypat
     monkeypatch.setattr(time, "strftime", lambda form: "now")
     names = []
     for _ in range(3):
-        names.append(kitti.new_name(tmp_path / "runs"))
+        names.append(kitti.unused_path(tmp_path / "runs"))
         names[-1].mkdir(parents=True)
     assert len(set(names)) == 3 and {path.parent for path in names} == {tmp_path / "runs"}
 
@@ -2657,13 +2657,13 @@ def test_metrics_draws_a_picture_if_matplotlib_is_installed(cwd, monkeypatch, ca
         fails_with_one_line(metrics.main, arguments, "matplotlib", capsys)
 
     pytest.importorskip("matplotlib")
-    figures, picture = [], metrics.picture
+    figures, new_figure = [], metrics.new_figure
 
     def remember(*size):
-        figures.append(picture(*size))
+        figures.append(new_figure(*size))
         return figures[-1]
 
-    monkeypatch.setattr(metrics, "picture", remember)
+    monkeypatch.setattr(metrics, "new_figure", remember)
     assert metrics.main(arguments) == 0
     metrics.draw("b.png", {"11": (None, T)})  # without ground truth
     for name in ("a.png", "b.png"):

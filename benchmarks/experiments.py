@@ -346,7 +346,7 @@ def run_child(experiment, variant, config, seed, folder, root, sequences, evalua
     """Start or resume a training run, then evaluate: the process that `run_one` starts."""
     torch.set_num_threads(1)
     kitti.keep_freed_memory()
-    kitti.terminate_as_interrupted()
+    kitti.treat_sigterm_as_interrupt()
     variant, folder = EXPERIMENTS[experiment][variant], Path(folder)
     d3dlo.train(Config(**config), root, sequences, folder, seed, network=variant.network,
                 objective=variant.objective(), resume=(folder / "config.json").exists())

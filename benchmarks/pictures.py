@@ -73,7 +73,7 @@ def method(root, name, i):
     on_ground = xyz[:sa2.n_fps, 2] < -1
     j = np.argmin(np.abs(ranges - 12) + 10 * on_ground)  # something upright, about 12 m away
 
-    figure = metrics.picture(14, 3.9)
+    figure = metrics.new_figure(14, 3.9)
     whole, ball1, ball2, flow = figure.subplots(1, 4)
     scatter(whole, scan, 0.3, "0.6")
     scatter(whole, xyz, 4, "black")
@@ -92,7 +92,7 @@ def network():
     net = d3dlo.D3DLO()
     parameters = {name: sum(p.numel() for p in block.parameters())
                   for name, block in net.named_children()}
-    figure = metrics.picture(11, 2.6)
+    figure = metrics.new_figure(11, 2.6)
     axis = figure.subplots()
     axis.set(xlim=(0, 11), ylim=(0, 2.6))
     axis.axis("off")
@@ -136,7 +136,7 @@ def paths(root, plain, refined, names):
         files = [folder / f"{s.name}.txt" for folder in (plain, refined)]
         poses = dict(zip(COLOURS, [s.poses_cam, *map(metrics.read_poses, files)]))
         drives.append(("simulated " * simulated + s.name, poses))
-    figure = metrics.picture(4.2 * len(drives), 4.6)
+    figure = metrics.new_figure(4.2 * len(drives), 4.6)
     axes = np.atleast_1d(figure.subplots(1, len(drives)))
     points = [np.concatenate([T[:, :3, 3] for T in poses.values()]) for _, poses in drives]
     half = 0.54 * max(np.ptp(xyz[:, [0, 2]], axis=0).max() for xyz in points)  # shared scale
@@ -167,7 +167,7 @@ def steps(plain, refined):
     """Draw bars: the error of a step on the real drives, plain, refined and of KISS-ICP."""
     results = {label: json.loads((folder / "results.json").read_text())["sequences"]
                for label, folder in (("plain", plain), ("refined", refined))}
-    figure = metrics.picture(8, 3)
+    figure = metrics.new_figure(8, 3)
     for k, (axis, unit) in enumerate(zip(figure.subplots(1, 2), ("cm", "deg"))):
         for i, label in enumerate(("plain", "refined", "KISS-ICP")):
             heights = [KISS_ICP[name][k] if label == "KISS-ICP" else
@@ -194,7 +194,7 @@ def curve(run):
     if not epochs:
         raise ValueError(f"{run}/log.txt: holds no epoch")
     epoch, training, test = np.array([[x or "nan" for x in row] for row in epochs], float).T
-    figure = metrics.picture(6, 3.3)
+    figure = metrics.new_figure(6, 3.3)
     axis = figure.subplots()
     axis.plot(epoch, training, "o-", color="tab:orange", label="training, augmented")
     if not np.isnan(test).all():
