@@ -164,7 +164,7 @@ TRUTH_NOISE = {"drive0013": 0.015, "drive0005": 0.024}
 
 
 def steps(plain, refined):
-    """Draw bars: the error of a step on the real drives, plain, refined and of KISS-ICP."""
+    """Draw bars: the error per step on the real drives, plain, refined and of KISS-ICP."""
     results = {label: json.loads((folder / "results.json").read_text())["sequences"]
                for label, folder in (("plain", plain), ("refined", refined))}
     figure = metrics.new_figure(8, 3)
@@ -176,7 +176,7 @@ def steps(plain, refined):
             axis.bar(np.arange(2) + 0.27 * (i - 1), heights, 0.25, color=COLOURS[label],
                      label=label)
         axis.set(xticks=range(2), xticklabels=[f"real {name}" for name in KISS_ICP],
-                 ylabel=f"mean error of a step [{unit}]")
+                 ylabel=f"mean error per step [{unit}]")
         axis.grid(axis="y", color="0.9")
         axis.set_axisbelow(True)
         if unit == "cm":
@@ -222,7 +222,7 @@ def main():
     p.add_argument("picture", type=Path)
     p.add_argument("data", metavar="ROOT", help="folder in KITTI odometry layout")
     p.add_argument("--sequences", nargs="+", default=["all"], metavar="NN", help="default: all")
-    b = commands.add_parser("steps", help="error of a step on the real drives")
+    b = commands.add_parser("steps", help="error per step on the real drives")
     b.add_argument("picture", type=Path)
     for command in (p, b):
         command.add_argument("plain", type=Path, metavar="P", help="folder written by eval")
