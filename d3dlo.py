@@ -91,7 +91,7 @@ class Config:
     # Training, section 4
     epochs: int = 500
     batch: int = 16  # pairs of scans in a batch; the paper does not say
-    optimizer: str = "adam"  # the paper's; or ours, "muon": Muon for the hidden matrices
+    optimizer: str = "adam"  # the paper's; or ours, "muon": Muon for the hidden layers
     lr: float = 1e-3  # learning rate: Adam's default; with "one-cycle" the peak
     schedule: str = "steps"  # lr / 10 (factor ours) after 3/5 and 4/5 of the steps; or "one-cycle"
     swap: str = "random"  # the paper's: one direction of each pair; or ours, "both"
@@ -497,7 +497,8 @@ def batches(geometry, motions, config, seed, start, stop, device="cpu"):
 
 
 def make_optimizers(net, objective):
-    """Adam, as in section 4. With "muon", the hidden matrices get Muon and all others Adam.
+    """Adam, as in section 4. With "muon": Muon for the weight matrices of hidden layers, Adam for
+    all other parameters.
 
     Muon's steps are scaled to the size of Adam's, so both use the same learning rate.
     """
@@ -1764,7 +1765,7 @@ def eval_options(command):
         "weights, or the folder of a training run (default: the pretrained weights)"))
     add("--refine", type=int, metavar="N", help=(
         "not in the paper: refine each pose in N passes, each with a new sampling of the scan, "
-        "against a keyframe; 4 is recommended (default: 0)"))
+        "against a keyframe; 3 is recommended (default: 0)"))
     add("--device", help="cpu, cuda or mps (default: cpu)")
     add = command.add_argument_group("results").add_argument
     add("--out", metavar="DIR", help=(

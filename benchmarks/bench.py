@@ -226,7 +226,7 @@ ROWS = {
                ("textbook loop", "fpsample exact", "fpsample buckets")),
     "geometry": Row(geometry, "sampling and grouping, a scan, one core", ("textbook FPS",)),
     "register": Row(register, "Odometry.register, a scan", ("KISS-ICP",)),
-    "refine": Row(functools.partial(register, refine=2), "the same, refine=2", ("KISS-ICP",)),
+    "refine": Row(functools.partial(register, refine=3), "the same, refine=3", ("KISS-ICP",)),
     "training": Row(training, "training step, a pair", ("plain",)),
     "fixed": Row(fixed_statistics, "the same, fixed statistics", ("plain",)),
     "inference": Row(inference, "inference, a pair, geometry given", ("plain",)),

@@ -7,7 +7,7 @@
 
 Trajectories and errors come from two evaluations of the same data, plain and refined:
 
-    python d3dlo.py eval --data ROOT --out P && python d3dlo.py eval --data ROOT --refine 2 --out R
+    python d3dlo.py eval --data ROOT --out P && python d3dlo.py eval --data ROOT --refine 3 --out R
     python benchmarks/pictures.py paths docs/paths.png ROOT P R --sequences 03 04 06
     python benchmarks/pictures.py steps docs/steps.png P R  # real drives 0013 and 0005
 """
@@ -226,7 +226,7 @@ def main():
     b.add_argument("picture", type=Path)
     for command in (p, b):
         command.add_argument("plain", type=Path, metavar="P", help="folder written by eval")
-        command.add_argument("refined", type=Path, metavar="R", help="by eval --refine 2")
+        command.add_argument("refined", type=Path, metavar="R", help="by eval --refine 3")
     c = commands.add_parser("curve", help="loss by epoch")
     c.add_argument("picture", type=Path)
     c.add_argument("run", type=Path, metavar="RUN", help="folder of a training run")
