@@ -1835,6 +1835,14 @@ def _expand_splits(sequences):
     return list(expanded)
 
 
+def default_scans(name):
+    """Number of scans that `simulate` makes for a sequence unless told otherwise.
+
+    Test and validation sequences are long enough for segments of 100 m, but quick to make.
+    """
+    return 170 if name in SPLITS["test"] + SPLITS["validation"] else 320
+
+
 def _missing_sequences(root, names, seed, scans, azimuth):
     """{name: settings} of the sequences that are not in ROOT yet.
 
@@ -1846,9 +1854,7 @@ def _missing_sequences(root, names, seed, scans, azimuth):
         if not isinstance(name, str) or name in ("", ".", "..") or re.search(r"[/\\\0]", name):
             raise ValueError(f"The sequence name {name!r} is no plain folder name: use one such "
                              "as '00'.")
-        # Test and validation: long enough for segments of 100 m, short enough to make on the spot
-        short = name in SPLITS["test"] + SPLITS["validation"]
-        settings = {"city": CITY, "seed": int(seed), "scans": int(scans or (170 if short else 320)),
+        settings = {"city": CITY, "seed": int(seed), "scans": int(scans or default_scans(name)),
                     "azimuth": int(azimuth)}
         folder, truth = root / "sequences" / name, root / "poses" / f"{name}.txt"
         if folder.exists() or truth.exists():
