@@ -408,16 +408,14 @@ def augment(scans, T_pq, aligned, rng):
     """Mirror half of the pairs left to right, then move every Q by a small random motion.
 
     Takes the records of n scans P, then of their n scans Q, (2n,), and T_pq (n,4,4). Returns both
-    after augmentation. Where `aligned` (n,) is true, Q is first aligned with P by T_pq, and the
-    random motion is smaller. A motion A that takes each point q of Q to A q turns T_pq into
-    T_pq A^-1. Not in the paper.
+    after augmentation. Where `aligned` (n,) is true, Q is first aligned with P by T_pq. A motion A
+    that takes each point q of Q to A q turns T_pq into T_pq A^-1. Not in the paper.
     """
     n = len(T_pq)
     mirror = np.where(rng.random((n, 1, 1)) < 0.5, np.diag([1.0, -1, 1, 1]), np.eye(4))
     T_pq = mirror @ T_pq @ mirror
     scale = [0.25, 0.1, 0.03, 0.1, 0.1, 1.0]  # m, degrees; most in yaw: turns are rare
-    size = np.where(aligned, rng.random(n), 1.0)  # smaller if aligned, like residuals in refinement
-    small = from_vector(rng.normal(size=(n, 6)) * scale * size[:, None])
+    small = from_vector(rng.normal(size=(n, 6)) * scale)
     A = small @ np.where(aligned[:, None, None], T_pq, np.eye(4))
     return move_scans(scans, np.concatenate([mirror, A @ mirror])), T_pq @ invert(A)
 
@@ -855,20 +853,24 @@ def mean_transform(transforms):
     return T
 
 
-def predict_refined(net, samplings_p, samplings_q, guess, device):
-    """Refine a guess of T_pq (4,4) with n samplings each of P and Q, records (n,) -> T_pq (4,4).
+def refine_pose(net, references, samplings, pose, device):
+    """Refine the pose T_0q (4,4) of a scan Q with n samplings, records (n,). Returns T_0q.
 
-    Each pass uses one sampling. It aligns Q with P by the current estimate, predicts the residual
-    motion in both directions, and updates the estimate. The result is the mean of all n estimates,
-    because most of their error depends on which points were sampled. Not in the paper.
+    references: a list of (samplings of an earlier scan P, records (n,), its pose T_0p). Each pass
+    uses one sampling and the next reference in turn. It aligns Q with P by the current estimate,
+    predicts the residual motion in both directions, and updates the estimate. The result is the
+    mean of all n estimates, because most of their error depends on which points were sampled. Not
+    in the paper.
     """
-    T, estimates = guess, []
-    for p, q in zip(samplings_p, samplings_q):
+    estimates = []
+    for k, q in enumerate(samplings):
+        samplings_p, T_0p = references[k % len(references)]
+        T = invert(T_0p) @ pose  # the current estimate of T_pq
         aligned, = move_scans(q[None], T[None])
-        pair = np.stack([p, aligned])
+        pair = np.stack([samplings_p[k], aligned])
         T_pq, T_qp = predict(net, pair, np.array([0, 1]), np.array([1, 0]), device)
-        T = mean_transform([T_pq, invert(T_qp)]) @ T
-        estimates.append(T)
+        pose = T_0p @ mean_transform([T_pq, invert(T_qp)]) @ T
+        estimates.append(pose)
     return mean_transform(estimates)
 
 
@@ -914,7 +916,7 @@ class Odometry:
 
     weights: a weights file or the folder of a training run. None: the pretrained weights.
     device: cpu, cuda or mps.
-    refine: number of refinement passes, see `predict_refined`. 0: the paper's plain prediction.
+    refine: number of refinement passes, see `refine_pose`. 0: the paper's plain prediction.
     network: the class of the network.
 
     Raises ValueError if an argument or the weights are invalid, and FileNotFoundError if there is
@@ -955,17 +957,16 @@ class Odometry:
         """`register` for a scan that is sampled already: records (max(refine, 1),) -> its pose."""
         pose = self.pose
         if self.last is not None:  # eq. 1
-            motion, = predict_motions(self.net, np.stack([self.last, records[0]]), self.device)
+            motion, = predict_motions(self.net, np.stack([self.last[0], records[0]]), self.device)
             pose = pose @ motion
-        # Refine the pose against a keyframe, an earlier scan that is replaced every few metres.
-        # Errors then add up from keyframe to keyframe, not from scan to scan.
+        # Refine the pose against a keyframe, an earlier scan that is replaced every few metres, and
+        # the last scan. Errors then add up from keyframe to keyframe, not from scan to scan.
         if self.keyframe is not None:
-            guess = invert(self.keyframe_pose) @ pose
-            T = predict_refined(self.net, self.keyframe, records, guess, self.device)
-            pose = self.keyframe_pose @ T
+            references = [(self.keyframe, self.keyframe_pose), (self.last, self.pose)]
+            pose = refine_pose(self.net, references, records, pose, self.device)
         if self.refine and (self.keyframe is None or is_far(invert(self.keyframe_pose) @ pose)):
             self.keyframe, self.keyframe_pose = records, pose
-        self.pose, self.last = pose, records[0]
+        self.pose, self.last = pose, records
         return pose.copy()
 
 
@@ -1140,7 +1141,7 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     sequences: a list of names or splits. None: all, or the simulated test and validation splits.
     out: the folder to write to. None: a new one, results/TIME.
     device: cpu, cuda or mps.
-    refine: number of refinement passes, see `predict_refined`.
+    refine: number of refinement passes, see `refine_pose`.
     plot: also draw OUT/plot.png.
     say: called with the text to print.
     network: the class of the network.
@@ -1765,7 +1766,7 @@ def eval_options(command):
         "weights, or the folder of a training run (default: the pretrained weights)"))
     add("--refine", type=int, metavar="N", help=(
         "not in the paper: refine each pose in N passes, each with a new sampling of the scan, "
-        "against a keyframe; 3 is recommended (default: 0)"))
+        "against a keyframe and the last scan in turn; 3 is recommended (default: 0)"))
     add("--device", help="cpu, cuda or mps (default: cpu)")
     add = command.add_argument_group("results").add_argument
     add("--out", metavar="DIR", help=(

@@ -669,12 +669,11 @@ def test_augmentation_mirrors_half_of_the_pairs_and_aligns_those_asked_for():
     mirrored = p[:, 1] < 0
     assert abs(mirrored.mean() - 0.5) < 0.05
     mirror = np.diag([1, -1, 1, 1])
-    for chosen, base, size in ((aligned, np.eye(4), np.sqrt(1 / 3)),
-                               (~aligned & mirrored, mirror @ far @ mirror, 1),
-                               (~aligned & ~mirrored, far, 1)):
+    for chosen, base in ((aligned, np.eye(4)), (~aligned & mirrored, mirror @ far @ mirror),
+                         (~aligned & ~mirrored, far)):
         A = to_vector(invert(T[chosen]) @ base)  # Q moves after it has been aligned
         assert_allclose(A.mean(0), 0, atol=0.15)
-        assert_allclose(A.std(0), np.multiply([0.25, 0.1, 0.03, 0.1, 0.1, 1.0], size), rtol=0.15)
+        assert_allclose(A.std(0), [0.25, 0.1, 0.03, 0.1, 0.1, 1.0], rtol=0.15)
 
 
 @given(SEED)
@@ -1679,7 +1678,7 @@ def test_samplings_share_no_centroid_and_are_grouped_in_the_whole_scan(seed, n, 
 
 
 @given(SEED, st.integers(1, 4))
-def test_refining_averages_directions_and_samplings(seed, n):
+def test_refining_averages_directions_samplings_and_references(seed, n):
     def one_way(p, q):
         """Replace the network by a small, smooth motion that differs in the two directions."""
         return from_vector((p["xyz"][:2] - 0.7 * q["xyz"][1:3]).ravel() / 10)
@@ -1693,16 +1692,18 @@ def test_refining_averages_directions_and_samplings(seed, n):
         return T
 
     rng = generator(seed)
-    p, q = (d3dlo.several_samplings(random_scan(rng, 48), SMALL, n) for _ in range(2))
-    guess = random_motion(rng, 0.1)
+    *earlier, q = (d3dlo.several_samplings(random_scan(rng, 48), SMALL, n) for _ in range(3))
+    poses, pose = random_motion(rng, n=2), random_motion(rng)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(d3dlo, "predict", predict_one_way)
-        got = d3dlo.predict_refined(None, p, q, guess, "cpu")
-    T, estimates = guess, []
-    for p_k, q_k in zip(p, q, strict=True):
-        aligned, = d3dlo.move_scans(q_k[None], T[None])  # tested with the augmentation
-        T = mean([one_way(p_k, aligned), invert(one_way(aligned, p_k))]) @ T
-        estimates.append(T)
+        got = d3dlo.refine_pose(None, list(zip(earlier, poses)), q, pose, "cpu")
+    estimates = []
+    for k in range(n):
+        p_k, T_0p = earlier[k % 2][k], poses[k % 2]
+        T = np.linalg.inv(T_0p) @ pose
+        aligned, = d3dlo.move_scans(q[k][None], T[None])  # tested with the augmentation
+        pose = T_0p @ mean([one_way(p_k, aligned), invert(one_way(aligned, p_k))]) @ T
+        estimates.append(pose)
     assert_allclose(got, mean(estimates), atol=2e-3)
 
 
@@ -1721,25 +1722,26 @@ def test_refined_odometry_registers_against_keyframes(tmp_path, seed):
         assert q == p + 1
         return [motions[p] @ from_vector([0.3, 0.1, 0, 0, 0, 1])]
 
-    def refined(net, keyframe, scan, guess, device):
-        p, q = number(keyframe), number(scan)
-        calls.append((p, q, len(keyframe), len(scan)))
-        T_pq = invert(truth[p]) @ truth[q]
-        assert_allclose(invert(T_pq) @ guess, from_vector([0.3, 0.1, 0, 0, 0, 1]), atol=1e-6)
-        return T_pq
+    def refined(net, references, samplings, pose, device):
+        q = number(samplings)
+        calls.append((*(number(records) for records, _ in references), q, len(samplings)))
+        for records, T_0p in references:
+            assert_allclose(T_0p, truth[number(records)], atol=1e-6)
+        assert_allclose(invert(truth[q]) @ pose, from_vector([0.3, 0.1, 0, 0, 0, 1]), atol=1e-6)
+        return truth[q]
 
     save_weights(tmp_path / "w.pt", SMALL)
     odometry = d3dlo.Odometry(tmp_path / "w.pt", refine=3)
     expected, keyframe = [], 0
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(d3dlo, "predict_motions", plain)
-        patch.setattr(d3dlo, "predict_refined", refined)
+        patch.setattr(d3dlo, "refine_pose", refined)
         for i in range(21):
             records = np.zeros(3, d3dlo.geometry_dtype(SMALL))
             records["broken"] = i
             assert_allclose(odometry.register_records(records), truth[i], atol=1e-6)
             if i:
-                expected.append((keyframe, i, 3, 3))
+                expected.append((keyframe, i - 1, i, 3))
                 T = invert(truth[keyframe]) @ truth[i]
                 angle = np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))
                 if np.linalg.norm(T[:3, 3]) >= 5 or angle >= 20:
