@@ -934,8 +934,8 @@ class Odometry:
 
     def restart(self):
         """Forget all scans. The next one defines the frame of the poses."""
-        self.pose, self.last = np.eye(4), None
-        self.keyframe, self.keyframe_pose = None, np.eye(4)
+        self.pose, self.last = np.eye(4), None  # of the last scan: its pose, its records
+        self.keyframe = None  # records and pose
 
     def register(self, scan: np.ndarray) -> np.ndarray:
         """Scan (N,4): x, y, z [m], intensity 0 to 1 -> its pose T_0t (4,4), Velodyne frame.
@@ -962,10 +962,10 @@ class Odometry:
         # Refine the pose against a keyframe, an earlier scan that is replaced every few metres, and
         # the last scan. Errors then add up from keyframe to keyframe, not from scan to scan.
         if self.keyframe is not None:
-            references = [(self.keyframe, self.keyframe_pose), (self.last, self.pose)]
+            references = [self.keyframe, (self.last, self.pose)]
             pose = refine_pose(self.net, references, records, pose, self.device)
-        if self.refine and (self.keyframe is None or is_far(invert(self.keyframe_pose) @ pose)):
-            self.keyframe, self.keyframe_pose = records, pose
+        if self.refine and (self.keyframe is None or is_far(invert(self.keyframe[1]) @ pose)):
+            self.keyframe = records, pose
         self.pose, self.last = pose, records
         return pose.copy()
 

@@ -489,7 +489,9 @@ def main():
     args = command_line()
     signal.signal(signal.SIGTERM, stop_children)
     root = Path(args.data or d3dlo.SIMULATED)
-    if args.dry_run and not args.data and not root.exists():  # count, but do not simulate
+    names = sum(kitti.SPLITS.values(), ())
+    complete = all((root / "poses" / f"{name}.txt").exists() for name in names)
+    if args.dry_run and not args.data and not complete:  # count, but do not simulate
         sequences, (scans, trained) = [], count_scans(root, args.sequences)
     else:
         root = root if args.data else kitti.simulate(root)
