@@ -1096,20 +1096,14 @@ def _drive(rng, scans, style):
     k = smooth(curvature, 1.7) + smooth(wobble, 8)
     s = np.arange(len(k)) * ds
 
-    # Speed: limited by the piece of road, the lateral acceleration in bends, and halts
-    lateral = rng.uniform(3.4, 4.6)  # [m/s2]
-    v = np.minimum(speed, np.sqrt(lateral / np.maximum(np.abs(k), 1e-4)))
+    lateral = rng.uniform(3.4, 4.6)  # largest acceleration in bends [m/s2]
     # The first halt is at the start, the others are up to 0.7 of the way
     n = int(style.halts * scans / 150)
     halts = start + 0.07 * style.cruise * scans * np.sort(rng.random(n)) * (np.arange(n) > 0)
+    limit = np.minimum(speed, np.sqrt(lateral / np.maximum(np.abs(k), 1e-4)))
     for halt in halts:
-        v[abs(s - halt) < 0.5] = 0.5
-    # Limit acceleration (forward pass) and braking (backward pass) to 2.5 m/s2
-    gain = 2 * 2.5 * ds  # largest change of v^2 in a step
-    for i in range(1, len(v)):
-        v[i] = min(v[i], np.sqrt(v[i - 1]**2 + gain))
-    for i in range(len(v) - 2, -1, -1):
-        v[i] = min(v[i], np.sqrt(v[i + 1]**2 + gain))
+        limit[abs(s - halt) < 0.5] = 0.5
+    v = _limit_acceleration(limit, ds)
 
     t = np.r_[0, np.cumsum(ds / smooth(v, 1.0))[:-1]]
     driven = s
@@ -1132,6 +1126,20 @@ def _drive(rng, scans, style):
         return np.interp(at, t, driven)
 
     return _Drive(position, distance, s[-1], halts)
+
+
+def _limit_acceleration(limit, ds):
+    """The highest speeds [m/s] below `limit` (n,), at points `ds` metres apart, that a car reaches.
+
+    It accelerates (forward pass) and brakes (backward pass) by 2.5 m/s2 at most.
+    """
+    v = limit.copy()
+    gain = 2 * 2.5 * ds  # largest change of v^2 in a step
+    for i in range(1, len(v)):
+        v[i] = min(v[i], np.sqrt(v[i - 1]**2 + gain))
+    for i in range(len(v) - 2, -1, -1):
+        v[i] = min(v[i], np.sqrt(v[i + 1]**2 + gain))
+    return v
 
 
 def _pieces_of_road(rng, style):
