@@ -93,11 +93,8 @@ def register(s, form, refine=0):
     """Registering a scan of a stream; the scans are in memory."""
     scans = [s.scan(i) for i in range(min(SCANS, len(s)))]
     if form == "KISS-ICP":
-        from kiss_icp.config import KISSConfig
-        from kiss_icp.kiss_icp import KissICP
-        config = KISSConfig()
-        config.data.deskew, config.data.max_range, config.mapping.voxel_size = False, 100.0, 1.0
-        icp = KissICP(config)
+        from classical import kiss_icp  # beside this file
+        icp = kiss_icp()
         todo = iter([(scan[:, :3].astype(float), np.zeros(len(scan))) for scan in scans])
         return seconds(lambda: icp.register_frame(*next(todo)), len(scans) - 1)
     odometry, todo = d3dlo.Odometry(refine=refine), iter(scans)

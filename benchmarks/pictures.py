@@ -9,7 +9,11 @@ Trajectories and errors come from two evaluations of the same data, plain and re
 
     python d3dlo.py eval --data ROOT --out P && python d3dlo.py eval --data ROOT --refine 3 --out R
     python benchmarks/pictures.py paths docs/paths.png ROOT P R --sequences 03 04 06
-    python benchmarks/pictures.py steps docs/steps.png P R  # real drives 0013 and 0005
+
+The errors of KISS-ICP on the same data come from benchmarks/classical.py:
+
+    python benchmarks/classical.py ROOT K
+    python benchmarks/pictures.py steps docs/steps.png P R K  # real drives
 """
 import argparse
 import json
@@ -158,30 +162,29 @@ def paths(root, plain, refined, names):
     return figure
 
 
-# Error of a step [m, deg]: KISS-ICP 1.3.0, and the noise of the ground truth [m]; docs/results.md
-KISS_ICP = {"drive0013": (0.026, 0.046), "drive0005": (0.032, 0.058)}
+# Error of a step [m] that comes from the noise of the ground truth, GPS/IMU; docs/results.md
 TRUTH_NOISE = {"drive0013": 0.015, "drive0005": 0.024}
 
 
-def steps(plain, refined):
+def steps(plain, refined, classical):
     """Draw bars: the error per step on the real drives, plain, refined and of KISS-ICP."""
+    folders = {"plain": plain, "refined": refined, "KISS-ICP": classical}
     results = {label: json.loads((folder / "results.json").read_text())["sequences"]
-               for label, folder in (("plain", plain), ("refined", refined))}
+               for label, folder in folders.items()}
     figure = metrics.new_figure(8, 3)
-    for k, (axis, unit) in enumerate(zip(figure.subplots(1, 2), ("cm", "deg"))):
-        for i, label in enumerate(("plain", "refined", "KISS-ICP")):
-            heights = [KISS_ICP[name][k] if label == "KISS-ICP" else
-                       results[label][name][("t_step_m", "r_step_deg")[k]] for name in KISS_ICP]
-            heights = np.array(heights) * (100 if unit == "cm" else 1)
+    for axis, key, unit in zip(figure.subplots(1, 2), ("t_step_m", "r_step_deg"), ("cm", "deg")):
+        for i, label in enumerate(results):
+            heights = np.array([results[label][name][key] for name in TRUTH_NOISE])
+            heights *= 100 if unit == "cm" else 1
             axis.bar(np.arange(2) + 0.27 * (i - 1), heights, 0.25, color=COLOURS[label],
                      label=label)
-        axis.set(xticks=range(2), xticklabels=[f"real {name}" for name in KISS_ICP],
+        axis.set(xticks=range(2), xticklabels=[f"real {name}" for name in TRUTH_NOISE],
                  ylabel=f"mean error per step [{unit}]")
         axis.grid(axis="y", color="0.9")
         axis.set_axisbelow(True)
         if unit == "cm":
-            for i, name in enumerate(TRUTH_NOISE):
-                axis.plot([i - 0.42, i + 0.42], [100 * TRUTH_NOISE[name]] * 2, "k--", lw=1,
+            for i, noise in enumerate(TRUTH_NOISE.values()):
+                axis.plot([i - 0.42, i + 0.42], [100 * noise] * 2, "k--", lw=1,
                           label="noise of the ground truth" if i == 0 else None)
             axis.legend(frameon=False, fontsize=8)
     return figure
@@ -227,6 +230,7 @@ def main():
     for command in (p, b):
         command.add_argument("plain", type=Path, metavar="P", help="folder written by eval")
         command.add_argument("refined", type=Path, metavar="R", help="by eval --refine 3")
+    b.add_argument("classical", type=Path, metavar="K", help="folder written by classical.py")
     c = commands.add_parser("curve", help="loss by epoch")
     c.add_argument("picture", type=Path)
     c.add_argument("run", type=Path, metavar="RUN", help="folder of a training run")
@@ -240,7 +244,7 @@ def main():
         elif args.command == "paths":
             figure = paths(args.data, args.plain, args.refined, args.sequences)
         elif args.command == "steps":
-            figure = steps(args.plain, args.refined)
+            figure = steps(args.plain, args.refined, args.classical)
         else:
             figure = curve(args.run)
         with metrics.replacing(args.picture) as temporary:

@@ -1,0 +1,88 @@
+"""Poses and errors of KISS-ICP, a classical method, on the scans and with the metric of `eval`.
+
+    pip install kiss-icp==1.3.0
+    python benchmarks/classical.py ROOT OUT          # ROOT in KITTI odometry layout, with poses
+    python benchmarks/classical.py ROOT OUT --sequences drive0005 drive0013
+
+KISS-ICP aligns each scan with a map of the scans before it. Writes OUT/NN.txt, KITTI pose files in
+the rectified left camera frame, and OUT/results.json. Prints the settings, and a table of errors.
+"""
+import argparse
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import kitti
+import metrics
+
+
+def kiss_icp():
+    """KISS-ICP with its default settings, but for 1 m voxels and without deskewing.
+
+    1 m is what it chooses itself for a range of 100 m. Deskewing needs the time of every point,
+    which KITTI's odometry data do not have. Raises ValueError if the package is not installed.
+    """
+    try:
+        from kiss_icp.config import KISSConfig
+        from kiss_icp.kiss_icp import KissICP
+    except ImportError:
+        raise ValueError("KISS-ICP is not installed: pip install kiss-icp==1.3.0") from None
+    config = KISSConfig()
+    config.data.deskew, config.data.max_range, config.mapping.voxel_size = False, 100.0, 1.0
+    return KissICP(config)
+
+
+def register(s, icp):
+    """Poses T_0t (n,4,4) of all scans of a `kitti.Sequence`, Velodyne frame, by a new `icp`."""
+    poses = []
+    for i in kitti.progress(range(len(s)), len(s), f"registering {s.name}, scans"):
+        scan = s.scan(i)
+        icp.register_frame(scan[:, :3].astype(float), np.zeros(len(scan)))
+        poses.append(icp.last_pose)
+    return np.stack(poses)
+
+
+def evaluate(root, names, out):
+    """Write OUT/NN.txt and OUT/results.json for some sequences of `root`, and print the table."""
+    icp = kiss_icp()
+    method = f"KISS-ICP {version('kiss-icp')}"
+    settings = icp.config.model_dump(exclude={"out_dir"})
+    print(method, *(f"{part}: {values}" for part, values in settings.items()), sep="\n")
+    errors, results = [], {}
+    for s in kitti.open_sequences(root, names):
+        poses = register(s, kiss_icp())
+        poses_cam = kitti.velo_to_camera(poses, s.Tr)
+        metrics.write_poses(out / f"{s.name}.txt", poses_cam)
+        segments = metrics.segment_errors(s.poses_cam, poses_cam)
+        errors.append((segments, metrics.step_errors(s.poses, poses)))
+        results[s.name] = metrics.summary([segments], [errors[-1][1]])
+    pooled = metrics.summary(*zip(*errors))
+    metrics.write_json(out / "results.json", {
+        "method": method, "settings": settings, "data": str(root), "sequences": results,
+        "pooled": pooled})
+    rows = [metrics.row(name, s) for name, s in [*results.items(), ("all", pooled)]]
+    print(metrics.table(metrics.HEADER, rows))
+    print("E_t, E_r: KITTI's segments, rectified left camera frame. t step, r step: mean "
+          "translation and rotation\nof inv(T_est) @ T_true of a step, Velodyne frame.\n"
+          f"trajectories  {out}/NN.txt\nerrors        {out}/results.json")
+
+
+def main():
+    """Run the command line."""
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("root", metavar="ROOT")
+    parser.add_argument("out", metavar="OUT", type=Path)
+    parser.add_argument("--sequences", nargs="+", default="all", metavar="NN", help="default: all")
+    args = parser.parse_args()
+    try:
+        evaluate(args.root, args.sequences, args.out)
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+
+
+if __name__ == "__main__":
+    main()
