@@ -2868,6 +2868,39 @@ def test_experiments_share_runs_but_not_across_data_or_budgets(tmp_path):
         assert not set(sum(runs.values(), [])) & set(sum(other.values(), []))
 
 
+@given(SEED, st.integers(1, 12))
+def test_a_cache_with_more_neighbours_serves_fewer(seed, n_n):
+    rng = generator(seed)
+    wide = replace(SMALL, sa1=SMALL.sa1._replace(n_n=12))
+    config = replace(SMALL, sa1=SMALL.sa1._replace(n_n=n_n))
+    scans = [random_scan(rng, 200) for _ in range(4)]
+    expected = np.stack([scan_geometry(scan, config) for scan in scans])
+    nearest = experiments.Nearest(np.stack([scan_geometry(scan, wide) for scan in scans]), config)
+    assert len(nearest) == 4 and nearest[1:3].dtype == expected.dtype
+    assert nearest[1:3].tobytes() == expected[1:3].tobytes()
+    assert nearest[3].tobytes() == expected[3].tobytes()
+    for name in expected.dtype.names:
+        assert_array_equal(nearest[name], expected[name])
+
+
+def test_runs_share_the_cache_with_most_neighbours_of_the_same_geometry(cwd, monkeypatch):
+    configs = [Config(**variant.changes) for rows in experiments.EXPERIMENTS.values()
+               for variant in rows.values()]
+    caches = {experiments.widest(config, configs) for config in configs}
+    facts = sorted((config.sa1.r, config.sa1.n_n, config.plane) for config in caches)
+    assert facts == [(1.0, 128, False), (1.0, 128, True), (2.0, 32, True)]
+
+    monkeypatch.setattr(d3dlo, "load_geometry", d3dlo.load_geometry)
+    sequences = kitti.open_sequences(write_root(cwd / "root"))
+    (expected,), fingerprints = d3dlo.load_geometry(sequences, SMALL, "cache of SMALL")
+    experiments.share_cache(12)
+    (records,), others = d3dlo.load_geometry(sequences, SMALL)
+    assert records[:].tobytes() == expected.tobytes() and others == fingerprints
+    other = replace(SMALL, sa1=SMALL.sa1._replace(n_n=3))
+    d3dlo.load_geometry(sequences, other)
+    assert len(list(Path("cache").iterdir())) == 1
+
+
 IDENTITY = b"1 0 0 0 0 1 0 0 0 0 1 0\n"
 
 

@@ -308,14 +308,64 @@ def seconds_a_step(config):
     return 0.015 * (0.85 + 0.15 * config.sa1.n_n / 8)
 
 
+# ------------------------------------------------------------------------------------------------
+# Caches: configurations that differ in n_n of SA1 alone share one
+
+
+class Nearest:
+    """The records of a sequence as those of a `config` with fewer neighbours in SA1.
+
+    The neighbours are in order of distance, so the nearest ones are the first ones.
+    """
+
+    def __init__(self, records, config):
+        self.records, self.n_n = records, config.sa1.n_n
+        self.dtype = d3dlo.geometry_dtype(config)
+
+    def __len__(self):
+        return len(self.records)
+
+    def __getitem__(self, key):
+        """The record of a scan, the records of a slice of scans, or all values of a field."""
+        wide = self.records[key]
+        if isinstance(key, str):
+            return wide[..., :self.n_n, :] if key == "group_sa1" else wide
+        records = np.zeros(wide.shape, self.dtype)
+        for name in self.dtype.names:
+            field = wide[name]
+            records[name] = field[..., :self.n_n, :] if name == "group_sa1" else field
+        return records
+
+
+def widest(config, configs):
+    """The Config among `configs` whose cache serves `config`: the one with the largest n_n."""
+    def settings(c):
+        return c.sa1._replace(n_n=None), c.sa2, c.sa3, c.plane, c.max_range
+
+    alike = [c for c in configs if settings(c) == settings(config)]
+    return max(alike, key=lambda c: c.sa1.n_n)
+
+
+def share_cache(n_n):
+    """Make `d3dlo.load_geometry` read caches with n_n neighbours in SA1, for any fewer."""
+    load = d3dlo.load_geometry
+
+    def load_nearest(sequences, config, cache="cache"):
+        wide = replace(config, sa1=config.sa1._replace(n_n=n_n))
+        geometry, fingerprints = load(sequences, wide, cache)
+        return [Nearest(records, config) for records in geometry], fingerprints
+
+    d3dlo.load_geometry = load_nearest
+
+
 CHILDREN = set()  # the processes of training runs under way
 
 
-def run_one(run, root, sequences, evaluated):
+def run_one(run, root, sequences, evaluated, cache_n_n):
     """Train and evaluate in a separate process. Raises RuntimeError if that fails."""
     job = dict(experiment=run.experiment, variant=run.variant, config=run.config.as_dict(),
                seed=run.seed, folder=str(run.folder), root=str(root), sequences=sequences,
-               evaluated=evaluated)
+               evaluated=evaluated, cache_n_n=cache_n_n)
     run.folder.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, __file__, "--child", json.dumps(job)]
     one_thread = os.environ | {"OMP_NUM_THREADS": "1"}
@@ -328,11 +378,12 @@ def run_one(run, root, sequences, evaluated):
         raise RuntimeError(f"{run.folder}: failed, see {run.folder}/output.txt")
 
 
-def run_child(experiment, variant, config, seed, folder, root, sequences, evaluated):
+def run_child(experiment, variant, config, seed, folder, root, sequences, evaluated, cache_n_n):
     """Start or resume a training run, then evaluate: the process that `run_one` starts."""
     torch.set_num_threads(1)
     kitti.keep_freed_memory()
     kitti.treat_sigterm_as_interrupt()
+    share_cache(cache_n_n)
     variant, folder = EXPERIMENTS[experiment][variant], Path(folder)
     d3dlo.train(Config(**config), root, sequences, folder, seed, network=variant.network,
                 objective=variant.objective(), resume=(folder / "config.json").exists())
@@ -346,29 +397,29 @@ def stop_children(number, frame):
     raise KeyboardInterrupt
 
 
-def run_all(todo, root, sequences, evaluated, jobs):
-    """Execute a list of Runs, `jobs` at a time."""
+def run_all(todo, root, sequences, evaluated, configs, jobs):
+    """Execute a list of Runs, `jobs` at a time. configs: of all Runs, also the finished ones."""
     pool = ThreadPoolExecutor(jobs)
     try:
-        futures = [pool.submit(run_one, run, root, sequences, evaluated) for run in todo]
+        futures = [pool.submit(run_one, run, root, sequences, evaluated,
+                               widest(run.config, configs).sa1.n_n) for run in todo]
         for future in kitti.progress(futures, len(futures), "training runs"):
             future.result()
     finally:  # start no further run after an interruption or a failure
         pool.shutdown(cancel_futures=True)
 
 
-def dry_run(todo, steps, scans, jobs):
-    """Print a list of Runs, about how long they take, and how large their caches will be."""
+def dry_run(todo, steps, scans, configs, jobs):
+    """Print a list of Runs, about how long they take, and how large the caches of all are."""
     total = 0
     for run in todo:
         seconds = steps * seconds_a_step(run.config)
         total += seconds
         print(f"{run.experiment}: {run.variant}, seed {run.seed}: {seconds / 60:.0f} minutes "
               "of one core")
-    caches = {(c.sa1, c.sa2, c.sa3, c.plane): d3dlo.geometry_dtype(c).itemsize
-              for c in (run.config for run in todo)}
+    size = sum(d3dlo.geometry_dtype(c).itemsize for c in configs if c == widest(c, configs))
     print(f"{total / 3600 / jobs:.1f} hours with {jobs} at a time, and the time to make caches of "
-          f"{scans * sum(caches.values()) / 1e9:.1f} GB")
+          f"{scans * size / 1e9:.1f} GB")
 
 
 # ------------------------------------------------------------------------------------------------
@@ -513,11 +564,12 @@ def main():
     steps = pair_steps(next(iter(unique.values())).config, pairs)
     print(f"{len(unique)} runs, {len(unique) - len(todo)} of them finished; {pairs:,} pairs of "
           f"{root}, {steps:,} pair-steps a run", flush=True)
+    configs = list(dict.fromkeys(run.config for run in unique.values()))
     if args.dry_run:
-        return dry_run(todo, steps, sum(scans.values()), args.jobs)
-    for config in dict.fromkeys(run.config for run in todo):  # caches first, with all cores
-        d3dlo.load_geometry(sequences, config)
-    run_all(todo, root, trained, evaluated, args.jobs)
+        return dry_run(todo, steps, sum(scans.values()), configs, args.jobs)
+    for run in todo:  # caches first, with all cores
+        d3dlo.load_geometry(sequences, widest(run.config, configs))
+    run_all(todo, root, trained, evaluated, configs, args.jobs)
     for experiment, rows in runs.items():
         words = caption(experiment, args, trained, pairs, steps)
         write_table(experiment, rows, args.out, words)
