@@ -427,18 +427,30 @@ def dry_run(todo, steps, scans, configs, jobs):
 
 HEADER = ["", "split", "parameters", "paper's E_t [%]", "paper's E_r [deg/m]",
           "E_t [%]", "E_r [deg/m]", "t step [m]", "r step [deg]"]
+DIGITS = {"E_t": 3, "E_r": 5, "t_step_m": 4, "r_step_deg": 4}  # after the decimal point
 
 
 def figures(run, split):
-    """E_t, E_r, t step and r step of a Run on a split."""
+    """E_t, E_r, t step and r step of a Run on a split, a dict. NaN where there is no segment."""
     results = json.loads((run.folder / "all" / "results.json").read_text(encoding="utf-8"))
     result = results["pooled"] if split == "all" else results["splits"][split]
-    figures = [result[key] for key in ("E_t", "E_r", "t_step_m", "r_step_deg")]
-    return [math.nan if x is None else x for x in figures]
+    return {key: math.nan if result[key] is None else result[key] for key in DIGITS}
+
+
+def figures_of_seeds(experiment, runs):
+    """{variant: {split: {figure: [its value for each seed]}}} of the Runs of an experiment."""
+    table = {}
+    for name, of_seeds in runs.items():
+        table[name] = {}
+        for split in splits_of(experiment):
+            each = [figures(run, split) for run in of_seeds]
+            table[name][split] = {key: [values[key] for values in each] for key in DIGITS}
+    return table
 
 
 def cell(values, digits):
     """Format the mean over the seeds and, if there are several, their range."""
+    values = np.array(values)
     if np.isnan(values).any():
         return "-"
     mean, low, high = (f"{x:.{digits}f}" for x in (values.mean(), values.min(), values.max()))
@@ -448,25 +460,25 @@ def cell(values, digits):
 def markdown(experiment, runs, words):
     """The table of an experiment in Markdown, followed by `words`."""
     lines = [HEADER, ["---"] * len(HEADER)]
-    for name, of_seeds in runs.items():
+    for name, splits in figures_of_seeds(experiment, runs).items():
         variant = EXPERIMENTS[experiment][name]
-        net = variant.network(of_seeds[0].config)
+        net = variant.network(runs[name][0].config)
         parameters = f"{sum(p.numel() for p in net.parameters()):,}"
-        for split in splits_of(experiment):
+        for split, values in splits.items():
             paper = [variant.paper, ""]
             if isinstance(variant.paper, dict):
                 E_t, E_r = variant.paper[split]
                 paper = [f"{E_t}", f"{E_r:.5f}"]
-            columns = np.array([figures(run, split) for run in of_seeds]).T  # (4,seeds)
-            ours = [cell(values, digits) for values, digits in zip(columns, (3, 5, 4, 4))]
+            ours = [cell(values[key], digits) for key, digits in DIGITS.items()]
             lines.append([name, split, parameters, *paper, *ours])
     table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
     return f"# {experiment}\n\n{table}\n\n{words}\n"
 
 
 def write_table(experiment, runs, out, words):
-    """Write OUT/EXPERIMENT.md and print it."""
+    """Write OUT/EXPERIMENT.md and print it. OUT/EXPERIMENT.json holds the figures of each seed."""
     text, path = markdown(experiment, runs, words), out / f"{experiment}.md"
+    metrics.write_json(out / f"{experiment}.json", figures_of_seeds(experiment, runs))
     with metrics.replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     print(f"\n{text}\n{path}")

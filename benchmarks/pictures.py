@@ -4,6 +4,7 @@
     python benchmarks/pictures.py method docs/method.png  # sampling and grouping of two scans
     python benchmarks/pictures.py method docs/method.png --data ROOT --sequence 00 --scan 100
     python benchmarks/pictures.py curve docs/curve.png runs/A  # loss by epoch
+    python benchmarks/pictures.py table2 docs/table2.png runs/experiments
 
 Trajectories and errors come from two evaluations of the same data, plain and refined:
 
@@ -24,6 +25,8 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from experiments import PAPER_2, row_of_table_2
+
 import d3dlo
 import kitti
 import metrics
@@ -208,6 +211,29 @@ def curve(run):
     return figure
 
 
+def table2(out):
+    """Draw Table 2, E_t by the number of neighbours: the paper's, and ours from OUT/table2.json."""
+    rows = json.loads((out / "table2.json").read_text(encoding="utf-8"))
+    n_n = sorted({neighbours for neighbours, _ in PAPER_2})
+    figure = metrics.new_figure(8, 3.2)
+    paper, ours = figure.subplots(1, 2)
+    for plane, colour in ((True, "tab:blue"), (False, "tab:orange")):
+        label = "with the plane" if plane else "without the plane"
+        paper.plot(n_n, [PAPER_2[n, plane][0] for n in n_n], "o-", color=colour, label=label)
+        E_t = np.array([rows[row_of_table_2(n, plane, None)[0]]["all"]["E_t"] for n in n_n])
+        ours.plot(n_n, E_t.mean(1), "-", color=colour, label=label)  # E_t (5,seeds)
+        ours.plot(n_n, E_t, "o", color=colour, markersize=4)
+    paper.set(title="the paper, on KITTI")
+    ours.set(title="here, in simulation (dots: seeds)")
+    for axis in (paper, ours):
+        axis.set_xscale("log", base=2)
+        axis.set(xticks=n_n, xticklabels=n_n, xlabel="neighbours n_n in SA1",
+                 ylabel="E_t, all sequences [%]", ylim=(0, None))
+        axis.grid(color="0.9")
+    paper.legend(frameon=False)
+    return figure
+
+
 def main():
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__,
@@ -234,6 +260,9 @@ def main():
     c = commands.add_parser("curve", help="loss by epoch")
     c.add_argument("picture", type=Path)
     c.add_argument("run", type=Path, metavar="RUN", help="folder of a training run")
+    t = commands.add_parser("table2", help="the paper's Table 2 and ours")
+    t.add_argument("picture", type=Path)
+    t.add_argument("out", type=Path, metavar="OUT", help="folder written by experiments.py table2")
     args = parser.parse_args()
     try:
         if args.command == "method":
@@ -245,6 +274,8 @@ def main():
             figure = paths(args.data, args.plain, args.refined, args.sequences)
         elif args.command == "steps":
             figure = steps(args.plain, args.refined, args.classical)
+        elif args.command == "table2":
+            figure = table2(args.out)
         else:
             figure = curve(args.run)
         with metrics.replacing(args.picture) as temporary:
