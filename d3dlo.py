@@ -10,8 +10,8 @@ Read this file beside the paper, from top to bottom:
     5  Weights files and devices
     6  Odometry                 eq. 1
     7  Evaluation               section 5
-    8  Faster versions of functions in parts 2 and 3. The code calls these, but they return the
-       same results. To understand the method, read parts 2 and 3.
+    8  Faster versions of functions in parts 2 and 3. The code calls these, and they return the
+       same results up to rounding. To understand the method, read parts 2 and 3.
     9  The command line
 
 kitti.py converts motions to the vectors of section 3.2 (`to_vector`), removes the ground plane
@@ -172,8 +172,8 @@ def group_ball(xyz: np.ndarray, centroids: np.ndarray, r: float, n_n: int, tree=
     """The neighbours i of each centroid j in eq. 3: the nearest n_n points with |x_i - x'_j| <= r.
 
     xyz (N,3) in metres, centroids (S,) indices into xyz -> (S,n_n) indices, nearest first. The
-    first one is the centroid itself, so no ball is empty. Missing neighbours are filled with the
-    centroid. These copies leave the maximum in eq. 3 unchanged but do affect the statistics of
+    first one is the centroid itself, or a point at the same place, so no ball is empty. Missing
+    neighbours are filled with the centroid. These copies leave the maximum in eq. 3 unchanged but do affect the statistics of
     batch normalisation. `tree`: a cKDTree of xyz, if there is one already.
     """
     ranks = [*range(1, n_n + 1)]  # a list keeps the result two-dimensional for n_n = 1
@@ -276,6 +276,18 @@ def make_batch(scans, p, q, config, device="cpu"):
     return Batch(xyz, *others, idx_fe)
 
 
+def neighbours_in_q(xyz, p, q, k):
+    """For every pair (P, Q) the k nearest centroids of Q for each centroid of P.
+
+    Centroids xyz (C,n,3) and index arrays p, q (B,) -> (B,n,k). On a CPU by `group_knn`. On other
+    devices the search runs there, to avoid waiting for the CPU.
+    """
+    if xyz.device.type == "cpu":
+        xyz = xyz.numpy()
+        return torch.from_numpy(np.stack([group_knn(xyz[j], xyz[i], k) for i, j in zip(p, q)]))
+    return knn_by_matrix(xyz[p], xyz[q], k)
+
+
 # ------------------------------------------------------------------------------------------------
 # 3  The network: section 3.3
 
@@ -358,18 +370,18 @@ class D3DLO(nn.Module):
     def forward(self, batch: Batch) -> torch.Tensor:
         """Batch -> y_hat (B,6): [tx, ty, tz] in metres, [roll, pitch, yaw] in degrees, of T_pq."""
         p, q = batch.p, batch.q
-        # SA1 for every scan, eq. 3. scan_geometry has gathered its inputs [f_i, x_i - x'_j].
+        # SA1 for every scan, eq. 3. group_scan has gathered its inputs [f_i, x_i - x'_j].
         features = self.sa1.mpn(batch.group_sa1)  # (C,1024,32)
         # FE for every pair, eq. 4. (index_select has a faster backward pass than [p].)
         x, f = batch.xyz[p], features.index_select(0, p)  # (B,1024,3), (B,1024,32) of P
         y, g = batch.xyz[q], features.index_select(0, q)  # (B,1024,3), (B,1024,32) of Q
         e = self.fe(x, f, y, g, batch.idx_fe)  # (B,1024,64)
         # SA2 and SA3 on P, eq. 3
-        e = self.sa2(x, e, batch.idx_sa2[p])  # (B,256,64)
-        x = x[:, :self.config.sa2.n_fps]  # (B,256,3)
-        e = self.sa3(x, e, batch.idx_sa3[p])  # (B,64,64)
+        f2 = self.sa2(x, e, batch.idx_sa2[p])  # (B,256,64)
+        x2 = x[:, :self.config.sa2.n_fps]  # (B,256,3)
+        f3 = self.sa3(x2, f2, batch.idx_sa3[p])  # (B,64,64)
         # Mini-PointNet and MLP
-        global_feature = self.mpn(e)  # (B,256)
+        global_feature = self.mpn(f3)  # (B,256)
         return self.mlp(global_feature)  # (B,6)
 
 
@@ -523,6 +535,9 @@ class Training:
     geometry, motions: two lists, with records (n,) and T_{t,t+1} (n-1,4,4) of each sequence.
     objective: a module (y_hat, y) -> loss. None: eq. 2.
     facts: values to store with the weights, see `training_facts`.
+
+    Batch normalisation uses the statistics of each batch. With `config.frozen`, they are computed
+    once from many batches at step `frozen_from`, and stay fixed from then on.
     """
 
     def __init__(self, net, geometry, motions, run, seed=0, device="cpu", objective=None, **facts):
@@ -557,7 +572,7 @@ class Training:
         """
         self.between_steps = False
         if self.step == self.frozen_from:
-            update_bn(self.bn_batches(), self.model)  # uses the Batch of each pair (Batch, T)
+            update_bn(self.bn_batches(), self.model)  # takes the first element of each (Batch, T)
         self.model.train(self.step < self.frozen_from)
         loss = self.objective(self.model(batch), targets(self.model, batch, T))
         require_finite(loss.item(), "the loss")
@@ -801,18 +816,6 @@ def to_device(array, device):
     if torch.device(device).type == "cuda":
         tensor = tensor.pin_memory()
     return tensor.to(device, non_blocking=True)
-
-
-def neighbours_in_q(xyz, p, q, k):
-    """For every pair (P, Q) the k nearest centroids of Q for each centroid of P.
-
-    Centroids xyz (C,n,3) and index arrays p, q (B,) -> (B,n,k). On a CPU by `group_knn`. On other
-    devices the search runs there, to avoid waiting for the CPU.
-    """
-    if xyz.device.type == "cpu":
-        xyz = xyz.numpy()
-        return torch.from_numpy(np.stack([group_knn(xyz[j], xyz[i], k) for i, j in zip(p, q)]))
-    return knn_by_matrix(xyz[p], xyz[q], k)
 
 
 def knn_by_matrix(x, y, k):
