@@ -173,8 +173,8 @@ def group_ball(xyz: np.ndarray, centroids: np.ndarray, r: float, n_n: int, tree=
 
     xyz (N,3) in metres, centroids (S,) indices into xyz -> (S,n_n) indices, nearest first. The
     first one is the centroid itself, or a point at the same place, so no ball is empty. Missing
-    neighbours are filled with the centroid. These copies leave the maximum in eq. 3 unchanged but do affect the statistics of
-    batch normalisation. `tree`: a cKDTree of xyz, if there is one already.
+    neighbours are filled with the centroid. These copies leave the maximum in eq. 3 unchanged but
+    do affect the statistics of batch normalisation. `tree`: a cKDTree of xyz, if there is one.
     """
     ranks = [*range(1, n_n + 1)]  # a list keeps the result two-dimensional for n_n = 1
     inclusive = np.nextafter(r, np.inf)  # scipy's bound is exclusive
@@ -910,6 +910,7 @@ def predict_motions(net, records, device="cpu", batch=16):
     return np.concatenate(motions)
 
 
+MAX_REFINE = 100  # passes; the time and memory of a scan grow with them
 INVALID_POINTS = "invalid points (not finite, or range or intensity out of bounds)"
 SHIFT_WARNING = "scans look unlike the training data; the poses may be wrong"
 
@@ -930,6 +931,8 @@ class Odometry:
                  network=D3DLO):
         check_device(device)
         check_number("refine", refine)
+        if refine > MAX_REFINE:
+            raise ValueError(f"refine must be at most {MAX_REFINE} passes, not {refine}")
         net, self.facts = load_weights(weights, network)
         self.net, self.device, self.refine = for_device(net, device), device, refine
         self.seen = self.facts["seen"]  # range of the scan statistics in training
@@ -1060,10 +1063,13 @@ def evaluate_sequence(odometry, s, records, out):
     return errors
 
 
-def evaluate_sequences(odometry, sequences, out):
-    """Predict the trajectories of sequences and write OUT/NN.txt. Returns what `summarize` does."""
+def evaluate_sequences(odometry, sequences, out, source):
+    """Predict the trajectories of sequences and write OUT/NN.txt. Returns what `summarize` does.
+
+    source: see `claim_results`.
+    """
     geometry, fingerprints = load_geometry(sequences, odometry.net.config)
-    clear_results(out)
+    claim_results(out, source)
     work = progress(zip(sequences, geometry), len(sequences), "registering, sequences")
     errors = {s.name: evaluate_sequence(odometry, s, records, out) for s, records in work}
     # Sequences are compared by content, since different data may have the same name
@@ -1071,29 +1077,28 @@ def evaluate_sequences(odometry, sequences, out):
     return summarize(errors, {s.name: f in known for s, f in zip(sequences, fingerprints)})
 
 
-def evaluate_folder(odometry, s, out, plot=False, say=print):
+def evaluate_folder(odometry, s, out, source, say=print):
     """Predict the trajectory of a `kitti.ScanFolder`, with poses in the LiDAR's frame.
 
     Writes OUT/poses.txt, OUT/poses.tum and OUT/results.json. Returns the folder OUT.
+    source: see `claim_results`.
     """
     began = time.monotonic()
     (records,), _ = load_geometry([s], odometry.net.config)
     poses = predict_poses(odometry, s, records)
     rate = len(s) / (time.monotonic() - began)
-    clear_results(out)
+    claim_results(out, source)
     metrics.write_poses(out / "poses.txt", poses)
     kitti.write_tum(out / "poses.tum", poses, s.times)
-    files, length = ["poses.txt", "poses.tum"], metrics.path_lengths(poses)[-1]
+    length = metrics.path_lengths(poses)[-1]
     lines = [f"{s.folder}: {len(s)} scans, path of {length:.1f} m, {rate:.1f} scans a second",
              *(f"note          {note}" for note in s.notes),
              "frame         LiDAR at the first scan: x forward, y left, z up, in metres",
-             f"trajectory    {out}/poses.txt (KITTI pose file)",
+             f"trajectory    {out}/poses.txt (12 numbers a line, as in KITTI's pose files)",
              f"              {out}/poses.tum (t x y z qx qy qz qw, t in seconds)"]
-    if plot:
+    if "plot.png" in source["files"]:
         metrics.draw(out / "plot.png", {s.name: (None, poses)})
-        files.append("plot.png")
         lines.append(f"plot          {out}/plot.png (from above)")
-    source = {"data": str(s.folder), "refine": odometry.refine, "files": files}
     metrics.write_json(out / "results.json", source | {"path_m": length, "scans": len(s)})
     say("\n".join(lines))
     return out
@@ -1160,37 +1165,61 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     out = kitti.unused_path("results") if out is None else Path(out)
     check_output(out, root)
     chosen = kitti.open_sequences(root, sequences)
-    if isinstance(chosen[0], kitti.ScanFolder):
-        return evaluate_folder(odometry, chosen[0], out, plot, say)
+    is_folder = isinstance(chosen[0], kitti.ScanFolder)
+    files = ["poses.txt", "poses.tum"] if is_folder else [f"{s.name}.txt" for s in chosen]
+    for_server = {f"{i}.txt" for i in range(11, 22)} <= set(files)  # KITTI's without ground truth
+    files += ["kitti-server.zip"] * for_server + ["plot.png"] * plot
+    check_results(out, files)
+    source = {"weights": str(weights or PRETRAINED), "data": str(root), "refine": refine,
+              "files": files}
+    if is_folder:
+        return evaluate_folder(odometry, chosen[0], out, source, say)
 
-    results = evaluate_sequences(odometry, chosen, out)
-    files = [f"{s.name}.txt" for s in chosen]
+    results = evaluate_sequences(odometry, chosen, out, source)
     lines = [f"trajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)",
              f"errors        {out}/results.json"]
-    if {f"{i}.txt" for i in range(11, 22)} <= set(files):  # KITTI's sequences without ground truth
+    if for_server:
         lines.append(f"to submit     {zip_for_server(out)}")
-        files.append("kitti-server.zip")
     if plot:
         T = {s.name: (s.poses_cam, metrics.read_poses(out / f"{s.name}.txt")) for s in chosen}
         metrics.draw(out / "plot.png", T)
         lines.append(f"plot          {out}/plot.png (from above, errors by length)")
-        files.append("plot.png")
-    source = {"weights": str(weights or PRETRAINED), "data": str(root), "refine": refine}
-    metrics.write_json(out / "results.json", source | results | {"files": files})
+    metrics.write_json(out / "results.json", source | results)
     say("\n".join([results_table(results), *lines]))
     return out
 
 
-def clear_results(out):
-    """Delete what an earlier evaluation wrote to OUT, as listed in OUT/results.json."""
+def earlier_results(out):
+    """The paths of the files in OUT that an earlier evaluation wrote, by OUT/results.json."""
     try:
         content = json.loads((out / "results.json").read_text(encoding="utf-8"))
-        files = [Path(name) for name in content["files"]]
-    except (OSError, ValueError, KeyError, TypeError):  # there is none, or it is not ours
-        return
-    for path in [*files, Path("results.json")]:
-        if path.name == str(path) and (out / path).is_file():
-            (out / path).unlink()
+        if not {"data", "refine", "files"} <= content.keys():  # not ours
+            return []
+        names = [name for name in content["files"] if Path(name).name == name]
+    except (OSError, ValueError, TypeError, AttributeError):  # there is none, or it is not ours
+        return []
+    written = [name for name in names if Path(name).suffix in (".txt", ".tum", ".png", ".zip")]
+    return [out / name for name in (*written, "results.json") if (out / name).is_file()]
+
+
+def check_results(out, files):
+    """Raise ValueError if an evaluation that writes `files` to OUT would replace other files."""
+    earlier = earlier_results(out)
+    for path in [out / name for name in (*files, "results.json")]:
+        if path.exists() and path not in earlier:
+            raise ValueError(f"{path} exists and is not from an earlier evaluation there: move it, "
+                             "or choose another --out")
+
+
+def claim_results(out, source):
+    """Delete what an earlier evaluation wrote to OUT, and begin OUT/results.json with `source`.
+
+    source: weights, data, refine, and the list of files that will be written. So these files are
+    known to be ours even if the evaluation is interrupted.
+    """
+    for path in earlier_results(out):
+        path.unlink()
+    metrics.write_json(out / "results.json", source)
 
 
 def zip_for_server(out):
@@ -1796,10 +1825,13 @@ def config_from(args):
 def main(argv=None):
     """Run the command line. Returns the exit code: 0, 2 for bad input, 130 when interrupted."""
     args = command_line(argv)
+    command = args.pop("command")
     kitti.keep_freed_memory()
     kitti.treat_sigterm_as_interrupt()
     try:
-        if args.pop("command") == "eval":
+        if empty := [name for name, value in args.items() if value == ""]:
+            raise ValueError(f"--{empty[0]} is empty; give a value, or leave the option out")
+        if command == "eval":
             evaluate(**args)
         elif "resume" in args and args.keys() - {"resume", "out", "device"}:
             raise ValueError("--resume continues with the options the run was started with; give "
@@ -1812,8 +1844,9 @@ def main(argv=None):
         return 130
     except BrokenPipeError:
         sys.stdout = open(os.devnull, "w")  # otherwise Python complains at exit
-        print("d3dlo: standard output was closed; if you were training, continue with "
-              "`python d3dlo.py train --out RUN --resume`", file=sys.stderr)
+        advice = ("; continue with `python d3dlo.py train --out RUN --resume`"
+                  if command == "train" else "")
+        print(f"d3dlo: standard output was closed{advice}", file=sys.stderr)
         return 2
     except (ValueError, OSError) as error:
         print(f"d3dlo: {error}", file=sys.stderr)

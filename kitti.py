@@ -69,7 +69,8 @@ def _check_scan_size(path, size):
     """Raise ValueError unless a .bin file of `size` bytes can hold a scan."""
     if size == 0 or size % 16:
         raise ValueError(f"{path} has {size} bytes, but a scan has 16 (four float32) per point: "
-                         f"copy or unpack it again. {FIVE_FLOATS}.")
+                         "if it is truncated, copy or unpack it again; if it has other columns, "
+                         f"save x, y, z, intensity as .npy. {FIVE_FLOATS}.")
 
 
 def read_scan(path: str | Path, intensity_max: float = 1) -> np.ndarray:
@@ -388,8 +389,14 @@ def sequence_names(root: str | Path) -> list[str]:
     names = sorted(folder.parent.name for folder in folders if any(folder.glob("*.bin")))
     if not names:
         remedy = "check the path and unpack its archives"
+        if not root.exists():
+            raise FileNotFoundError(f"{root}: no such folder; check the path.")
+        if root.is_file():
+            raise FileNotFoundError(f"{root} is a file: give the folder that holds the scans.")
         if _is_raw_data(root):
             remedy = "convert KITTI's raw data with `python kitti.py raw DRIVE ROOT`"
+        elif any(path.suffix.lower() in (".pcd", ".ply", ".las") for path in root.iterdir()):
+            remedy = "save the points of each file as .npy, (N,4): x, y, z, intensity"
         raise FileNotFoundError(
             f"{root} has no scans in a known layout: {remedy}. Known layouts: a folder of *.bin or "
             "*.npy files, and KITTI's odometry layout, ROOT/sequences/00/{velodyne/000000.bin, "
@@ -450,7 +457,7 @@ def usable_points(scan, max_range=None, plane=True):
         scan = np.asarray(scan, np.float32)
         if scan.ndim != 2 or scan.shape[1] != 4:
             raise ValueError(f"a scan has the shape (N, 4), not {scan.shape}; give x, y, z [m] and "
-                             "intensity for N points")
+                             "intensity for N points, zeros if there are no intensities")
         x, y, z, intensity = scan.T  # (N,) each
         squared_range = x * x + y * y + z * z
         # A comparison with NaN is false

@@ -148,7 +148,12 @@ def read_poses(path: str | Path) -> np.ndarray:
 
 
 def write_poses(path: str | Path, T: np.ndarray) -> None:
-    """Write poses (n,4,4) as a KITTI pose file. Raises OSError if it cannot be written."""
+    """Write poses (n,4,4) as a KITTI pose file.
+
+    Raises ValueError for another shape, and OSError if the file cannot be written.
+    """
+    if np.ndim(T) != 3 or np.shape(T)[1:] != (4, 4):
+        raise ValueError(f"poses have the shape (n, 4, 4), not {np.shape(T)}")
     rows = np.asarray(T)[:, :3].reshape(-1, 12)
     with replacing(path) as temporary, open(temporary, "w", newline="\n") as file:
         np.savetxt(file, rows, fmt="%.9e")

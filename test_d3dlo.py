@@ -25,6 +25,7 @@ import zipfile
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -2134,9 +2135,46 @@ def test_eval_into_the_same_folder_deletes_the_earlier_results_and_nothing_else(
     (cwd / "out" / "results.json").write_text(json.dumps(content))
     assert evaluate("03") == {"03.txt", "results.json", "notes.txt", "00.txt"}
     assert (cwd / "root" / "notes.txt").read_text() == "mine" and (cwd / "w.pt").exists()
-    for content in ("[]", '{"files": null}', '{"files": [1]}', "no JSON"):  # not our format
-        (cwd / "out" / "results.json").write_text(content)
-        assert evaluate("03") == {"03.txt", "results.json", "notes.txt", "00.txt"}
+    content = results_of("out")
+    content["files"].append("thesis.tex")  # eval writes no such file
+    (cwd / "out" / "results.json").write_text(json.dumps(content))
+    (cwd / "out" / "thesis.tex").write_text("mine")
+    evaluate("03")
+    assert (cwd / "out" / "thesis.tex").read_text() == "mine"
+
+
+@table("name, content", {
+    **{f"results.json: {content}": ("results.json", content) for content in (
+        "[]", '{"files": ["03.txt"]}', '{"data": "", "refine": 0, "files": null}', "no JSON")},
+    "a trajectory": ("03.txt", "mine"),
+    "a picture": ("plot.png", "mine")})
+def test_eval_never_replaces_files_that_are_not_its_own(cwd, capsys, name, content):
+    pytest.importorskip("matplotlib")
+    write_root(cwd / "root", ("03",), size=60)
+    save_weights("w.pt", SMALL)
+    (cwd / "out").mkdir()
+    (cwd / "out" / name).write_text(content)
+    command = "eval --data root --weights w.pt --out out --plot".split()
+    fails_with_one_line(d3dlo.main, command, name, capsys)
+    assert files_of(cwd / "out") == {name: content.encode()}
+
+
+def test_eval_into_the_folder_of_an_interrupted_one_replaces_its_files(cwd, monkeypatch):
+    write_root(cwd / "root", ("03", "07"), size=60)
+    save_weights("w.pt", SMALL)
+    with monkeypatch.context() as patch:
+        patch.setattr(d3dlo, "summarize", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            d3dlo.evaluate("root", "w.pt", ["07"], "out")
+    assert set(os.listdir("out")) == {"07.txt", "results.json"}
+    d3dlo.evaluate("root", "w.pt", ["03"], "out")
+    assert set(os.listdir("out")) == {"03.txt", "results.json"}
+
+
+def test_an_empty_option_is_refused(cwd, capsys):
+    for option in ("--data", "--weights", "--out"):
+        fails_with_one_line(d3dlo.main, ["eval", option, ""], f"{option} is empty", capsys)
+    assert not os.listdir()
 
 
 def test_eval_refines_as_often_as_asked(cwd):

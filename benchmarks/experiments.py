@@ -258,7 +258,8 @@ class Run(NamedTuple):
 
     def finished(self):
         """Whether its results are there."""
-        return (self.folder / "all" / "results.json").exists()
+        results = self.folder / "all" / "results.json"
+        return results.exists() and "pooled" in json.loads(results.read_text(encoding="utf-8"))
 
 
 def pair_steps(config, pairs):
