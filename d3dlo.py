@@ -801,8 +801,8 @@ def check_device(device):
     try:
         torch.empty(1, device=device).cpu()
     except (RuntimeError, AssertionError, NotImplementedError):
-        raise ValueError(f"--device {device}: not available; use cpu, or cuda or mps if this "
-                         "PyTorch supports it") from None
+        raise ValueError(f"device {device}: this PyTorch cannot use it; use cpu, or install a "
+                         "PyTorch for it") from None
 
 
 def for_device(net, device):
@@ -1522,13 +1522,16 @@ SIMULATED = Path("data/simulated")  # the simulated city, used without --data
 
 def check_number(name, value):
     """Raise ValueError unless a value is a non-negative integer of at most 63 bits."""
-    if not isinstance(value, int) or not 0 <= value < 2**63:
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not (whole and 0 <= value < 2**63):
         raise ValueError(f"{name} must be a non-negative integer, not {value!r}")
 
 
 def check_output(path, root):
-    """Raise ValueError if results would be written among the data, which they could overwrite."""
+    """Raise ValueError unless `path` can be a folder of results outside the data in `root`."""
     path, root = Path(path).resolve(), Path(root).resolve()
+    if path.is_file():
+        raise ValueError(f"--out {path} is a file; choose a folder")
     if path == root or any(path.is_relative_to(root / name) for name in ("sequences", "poses")):
         raise ValueError(f"--out {path} is inside the data folder; choose another folder")
 

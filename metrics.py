@@ -466,10 +466,10 @@ def main(argv=None):
     except (ValueError, OSError) as error:
         print(f"metrics.py: {error}", file=sys.stderr)
         return 2
-    print(_report(trajectories))
-    print(UNITS)
+    lines = [_report(trajectories), UNITS]
     if args.plot:
-        print(args.plot)
+        lines.append(str(args.plot))
+    print("\n".join(lines))
     return 0
 
 

@@ -2352,16 +2352,34 @@ def test_bad_data_fails_with_one_line_and_leaves_no_files(cwd, weights, capsys, 
     assert [name for name in files_of(cwd) if not name.startswith("root/")] == []
 
 
+def test_refine_takes_whole_numbers_of_numpy_but_not_booleans():
+    assert d3dlo.Odometry(refine=np.int64(2)).refine == 2
+    for wrong in (True, 1.0, "1", -1):
+        with pytest.raises(ValueError, match="refine must be a non-negative integer"):
+            d3dlo.Odometry(refine=wrong)
+
+
+@pytest.mark.parametrize("T", [np.eye(4), np.zeros((3, 3, 4)), np.zeros((2, 4, 3))])
+def test_poses_of_another_shape_are_not_written(tmp_path, T):
+    with pytest.raises(ValueError, match="shape"):
+        metrics.write_poses(tmp_path / "poses.txt", T)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("arguments, words", {  # words: what the message must contain
     "eval --data root --sequences 42": "42",
     "eval --data root --sequences ../sequences/00": "../sequences/00",
-    "eval --data gone": "gone",
+    "eval --data gone": "gone: no such folder",
+    "eval --data root/poses/00.txt": "00.txt is a file",
+    "eval --data pcd": "save the points of each file as .npy",
+    "eval --data root --out root/poses/00.txt": "is a file",
     "eval --data root --weights gone.pt": "gone.pt",
     "eval --data root --weights root": "root/weights.pt",
     "eval --sequences 0O": "0O",  # not in the simulated city
     "eval --data root --device nonsense": "nonsense",
-    "eval --data root --device meta": "--device meta",
+    "eval --data root --device meta": "device meta",
     "eval --data root --refine -1": "refine",
+    "eval --data root --refine 101": "at most 100 passes",
     "train --resume": "--out",
     "train --resume --out gone": "gone",
     "train --data root --sequences test": "test",
@@ -2373,10 +2391,12 @@ def test_bad_data_fails_with_one_line_and_leaves_no_files(cwd, weights, capsys, 
     "train --data root --neighbors 99999999": "n_n",
     f"train --data root --seed {10**23}": "seed",
     "train --data root --seed -1": "seed",
-    "train --data root --device meta": "--device meta",
+    "train --data root --device meta": "device meta",
 }.items())
 def test_bad_arguments_fail_with_one_line(cwd, capsys, arguments, words):
     write_root(cwd / "root")
+    (cwd / "pcd").mkdir()
+    (cwd / "pcd" / "0.pcd").touch()
     before = sorted(cwd.rglob("*"))
     fails_with_one_line(d3dlo.main, arguments.split(), words, capsys)
     assert sorted(cwd.rglob("*")) == before

@@ -157,7 +157,7 @@ def paths(root, plain, refined, names):
         middle = (xyz.max(0) + xyz.min(0)) / 2
         axis.set(title=f"{name}, {metrics.path_lengths(truth)[-1]:,.0f} m. Off at the end:\n"
                  f"plain {drift['plain']:.1f} m, refined {drift['refined']:.1f} m",
-                 xlabel="x, right [m]", ylabel="z, forward [m]", aspect="equal",
+                 xlabel="to the right [m]", ylabel="forward [m]", aspect="equal",
                  xlim=(middle[0] - half, middle[0] + half),
                  ylim=(middle[2] - half, middle[2] + half))
         axis.grid(color="0.9")
