@@ -998,6 +998,9 @@ def relative_pose(scan_p: np.ndarray, scan_q: np.ndarray, weights: str | Path | 
 # 7  Evaluation: section 5
 
 BASELINES = "standing still", "mean motion of training"
+LEGEND = """E_t, E_r: KITTI's segments of 100 to 800 m, rectified left camera frame. t step, r step:
+mean translation and rotation of inv(T_est) @ T_true of a step, Velodyne frame. -: no such segment,
+or no ground truth."""
 GEOMETRY_VERSION = 4  # increase it when `scan_geometry` changes, so that old caches are not read
 
 
@@ -1133,10 +1136,7 @@ def results_table(results):
         rows.append(row(name, s))
         rows += [metrics.row(f"  {predictor}", s[predictor]) for predictor in BASELINES]
     rows += [metrics.row(length, s) for length, s in results["lengths"].items()]
-    return (metrics.table(metrics.HEADER, rows) + "\n"
-            "*: trained on. E_t, E_r: KITTI's segments of 100 to 800 m, rectified left camera "
-            "frame. t step, r step: mean\ntranslation and rotation of inv(T_est) @ T_true of a "
-            "step, Velodyne frame. -: no such segment, or no ground truth.")
+    return f"{metrics.table(metrics.HEADER, rows)}\n*: trained on. {LEGEND}"
 
 
 def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", refine=0, plot=False,
@@ -1168,7 +1168,10 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     is_folder = isinstance(chosen[0], kitti.ScanFolder)
     files = ["poses.txt", "poses.tum"] if is_folder else [f"{s.name}.txt" for s in chosen]
     for_server = {f"{i}.txt" for i in range(11, 22)} <= set(files)  # KITTI's without ground truth
-    files += ["kitti-server.zip"] * for_server + ["plot.png"] * plot
+    if for_server:
+        files.append("kitti-server.zip")
+    if plot:
+        files.append("plot.png")
     check_results(out, files)
     source = {"weights": str(weights or PRETRAINED), "data": str(root), "refine": refine,
               "files": files}

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import d3dlo
 import kitti
 import metrics
 
@@ -64,10 +65,8 @@ def evaluate(root, names, out):
         "method": method, "settings": settings, "data": str(root), "sequences": results,
         "pooled": pooled})
     rows = [metrics.row(name, s) for name, s in [*results.items(), ("all", pooled)]]
-    print(metrics.table(metrics.HEADER, rows))
-    print("E_t, E_r: KITTI's segments, rectified left camera frame. t step, r step: mean "
-          "translation and rotation\nof inv(T_est) @ T_true of a step, Velodyne frame.\n"
-          f"trajectories  {out}/NN.txt\nerrors        {out}/results.json")
+    print(metrics.table(metrics.HEADER, rows), d3dlo.LEGEND, f"trajectories  {out}/NN.txt",
+          f"errors        {out}/results.json", sep="\n")
 
 
 def main():

@@ -328,14 +328,17 @@ class Nearest:
 
     def __getitem__(self, key):
         """The record of a scan, the records of a slice of scans, or all values of a field."""
-        wide = self.records[key]
         if isinstance(key, str):
-            return wide[..., :self.n_n, :] if key == "group_sa1" else wide
+            return self.narrow(self.records, key)
+        wide = self.records[key]
         records = np.zeros(wide.shape, self.dtype)
         for name in self.dtype.names:
-            field = wide[name]
-            records[name] = field[..., :self.n_n, :] if name == "group_sa1" else field
+            records[name] = self.narrow(wide, name)
         return records
+
+    def narrow(self, wide, name):
+        """The values of a field of wide records, with the first n_n neighbours of SA1 only."""
+        return wide[name][..., :self.n_n, :] if name == "group_sa1" else wide[name]
 
 
 def widest(config, configs):
@@ -458,10 +461,13 @@ def cell(values, digits):
     return mean if len(values) == 1 else f"{mean} ({low} to {high})"
 
 
-def markdown(experiment, runs, words):
-    """The table of an experiment in Markdown, followed by `words`."""
+def markdown(experiment, runs, measured, words):
+    """The table of an experiment in Markdown, followed by `words`.
+
+    measured: the result of `figures_of_seeds`.
+    """
     lines = [HEADER, ["---"] * len(HEADER)]
-    for name, splits in figures_of_seeds(experiment, runs).items():
+    for name, splits in measured.items():
         variant = EXPERIMENTS[experiment][name]
         net = variant.network(runs[name][0].config)
         parameters = f"{sum(p.numel() for p in net.parameters()):,}"
@@ -478,8 +484,9 @@ def markdown(experiment, runs, words):
 
 def write_table(experiment, runs, out, words):
     """Write OUT/EXPERIMENT.md and print it. OUT/EXPERIMENT.json holds the figures of each seed."""
-    text, path = markdown(experiment, runs, words), out / f"{experiment}.md"
-    metrics.write_json(out / f"{experiment}.json", figures_of_seeds(experiment, runs))
+    measured = figures_of_seeds(experiment, runs)
+    text, path = markdown(experiment, runs, measured, words), out / f"{experiment}.md"
+    metrics.write_json(out / f"{experiment}.json", measured)
     with metrics.replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     print(f"\n{text}\n{path}")
