@@ -34,6 +34,7 @@ import itertools
 import json
 import math
 import os
+import pickle
 import sys
 import time
 import warnings
@@ -783,6 +784,8 @@ def load_weights(path: str | Path | None = None, network=D3DLO, checkpoint: bool
             raise ValueError("damaged")
     except Exception as error:  # torch and pickle raise many exception types for a bad file
         reason = f"{type(error).__name__}: {error}".splitlines()[-1].strip()
+        if isinstance(error, pickle.UnpicklingError):  # torch's own text is long
+            reason = "it is damaged, or holds Python objects, which are not loaded for safety"
         raise ValueError(f"{path}: cannot be read as D3DLO weights ({reason:.120}); give a "
                          "weights.pt or the folder of a training run") from None
     if checkpoint and "losses" not in state:

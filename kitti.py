@@ -307,7 +307,7 @@ class ScanFolder(Sequence):
             if path.suffix == ".bin":
                 _check_scan_size(path, path.stat().st_size)
 
-        self.notes = []
+        self.notes = _notes_on_gaps(self.scan_paths)
         largest = _largest_intensity(self.scan_paths)
         self.intensity_max = 255 if largest > 1 else 1
         if largest == 0:
@@ -330,6 +330,18 @@ def scans_in(folder):
 
     paths = [path for path in Path(folder).glob("[!.]*") if path.suffix in (".bin", ".npy")]
     return sorted(paths, key=with_padded_numbers)
+
+
+def _notes_on_gaps(paths):
+    """A list with a line on scans that are missing, if the files are numbered one by one."""
+    if not all(path.stem.isdecimal() for path in paths):
+        return []
+    steps = np.diff([int(path.stem) for path in paths])
+    gaps = np.flatnonzero(steps > 1)
+    if not len(gaps) or np.median(steps) != 1:  # other numbers, such as times, have no gaps
+        return []
+    return [f"{(steps - 1).sum()} scans are missing, the first after {paths[gaps[0]].name}; "
+            "the motion across a gap may be wrong"]
 
 
 def _largest_intensity(paths):

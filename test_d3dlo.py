@@ -1327,6 +1327,19 @@ def test_times_of_a_folder_come_from_times_txt_or_assume_ten_scans_a_second(tmp_
     assert s.notes == []
 
 
+@pytest.mark.parametrize("name, removed, note", [
+    ("{:06d}.npy", (4, 5, 9), "3 scans are missing, the first after 000003.npy"),
+    ("{}00000.npy", (4, 5, 9), ""), ("scan {}.npy", (4, 5, 9), ""),  # times and other names
+    ("{:06d}.npy", (1, 2, 12), ""), ("{:06d}.npy", range(2, 12, 2), "")])  # cut, every second scan
+def test_missing_scans_of_a_numbered_folder_are_noted(tmp_path, name, removed, note):
+    write_folder(tmp_path / "drive", name=name)
+    for i in removed:
+        (tmp_path / "drive" / name.format(i)).unlink()
+    s, = kitti.open_sequences(tmp_path / "drive")
+    notes = [text for text in s.notes if "missing" in text]
+    assert len(notes) == bool(note) and note in "".join(notes)
+
+
 @pytest.mark.parametrize("scale, columns, divisor, words", [
     (0.9, 4, 1, ""), (255, 4, 255, "255"), (2, 4, 255, "255"),
     (1, 3, 1, "no intensities"), (0, 4, 1, "no intensities")])
@@ -1893,11 +1906,12 @@ def error_lines(err):
 
 
 def fails_with_one_line(main, arguments, words, capsys):
-    """Assert that a command fails with one line on stderr that contains `words`."""
+    """Assert that a command fails with one line on stderr that contains `words`. Returns it."""
     code = main([str(argument) for argument in arguments])
     out, err = capsys.readouterr()
     lines = error_lines(err)
     assert code == 2 and len(lines) == 1 and words in lines[0] and "Traceback" not in err + out, err
+    return lines[0]
 
 
 def table_row(out, name):
@@ -2435,7 +2449,8 @@ def test_files_that_are_not_weights_fail_with_one_line_and_run_no_code(cwd, caps
     save_weights("good.pt", SMALL)
     (cwd / "bad.pt").write_bytes(spoil((cwd / "good.pt").read_bytes()))
     arguments = "eval --data root --weights bad.pt --out out".split()
-    fails_with_one_line(d3dlo.main, arguments, "bad.pt", capsys)
+    error = fails_with_one_line(d3dlo.main, arguments, "bad.pt", capsys)
+    assert "http" not in error  # torch's advice to load it nevertheless
     assert not (cwd / "out").exists() and not (cwd / "mischief").exists()
 
 

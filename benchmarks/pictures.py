@@ -127,8 +127,10 @@ def network():
     for (name, title), begin, end in zip(blocks.items(), begins, ends):
         box(places[name], 1.4, name, title)
         arrow((begin, 1.4), (end, 1.4), outputs[name])
-    axis.text(5.5, 0.2, f"{sum(parameters.values()):,} parameters. The output is a translation in "
-              "metres and three angles in degrees.", ha="center", fontsize=9)
+    axis.text(5.5, 0.15, "In the boxes: parameters, "
+              f"{sum(parameters.values()):,} in all. At the arrows: points x features.\n"
+              "A point of a scan has x, y, z and intensity. The output is a translation in metres "
+              "and three angles in degrees.", ha="center", fontsize=9)
     return figure
 
 
