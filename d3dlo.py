@@ -21,7 +21,7 @@ in benchmarks/experiments.py. docs/paper-differences.md lists the differences fr
 
 Frame: Velodyne, x forward, y left, z up, in metres. T_ab maps points from frame b to frame a;
 T_pq is the paper's T_{t,t+1}. Shapes: N points of a scan, S centroids, k neighbours, c features,
-C scans in a batch, B pairs of them; n1, n2, n3 are n_fps of SA1, SA2, SA3.
+C scans in a batch, B pairs of them; n1 to n3 and k1 to k3 are n_fps and n_n of SA1 to SA3.
 
     python d3dlo.py train                       # on a simulated city; 15 minutes on a CPU
     python d3dlo.py train --data ROOT           # on KITTI odometry, with the paper's settings
@@ -175,7 +175,7 @@ def group_ball(xyz: np.ndarray, centroids: np.ndarray, r: float, n_n: int, tree=
     xyz (N,3) in metres, centroids (S,) indices into xyz -> (S,n_n) indices, nearest first. The
     first one is the centroid itself, or a point at the same place, so no ball is empty. Missing
     neighbours are filled with the centroid. These copies leave the maximum in eq. 3 unchanged but
-    do affect the statistics of batch normalisation. `tree`: a cKDTree of xyz, if there is one.
+    do affect the statistics of batch normalisation. tree: a cKDTree of xyz. None builds one.
     """
     ranks = [*range(1, n_n + 1)]  # a list keeps the result two-dimensional for n_n = 1
     inclusive = np.nextafter(r, np.inf)  # scipy's bound is exclusive
@@ -194,7 +194,7 @@ def group_knn(xyz: np.ndarray, query: np.ndarray, k: int) -> np.ndarray:
 
 
 def geometry_dtype(config):
-    """The record of a scan: the network's input, and what is reported about the scan."""
+    """The dtype of a scan's record: the network's input, and statistics of the scan."""
     n1, n2, n3 = config.sa1.n_fps, config.sa2.n_fps, config.sa3.n_fps
     return np.dtype([
         ("xyz", "f4", (n1, 3)),  # centroids of SA1; the first n2 are SA2's, the first n3 SA3's
@@ -280,7 +280,7 @@ def make_batch(scans, p, q, config, device="cpu"):
 def neighbours_in_q(xyz, p, q, k):
     """For every pair (P, Q) the k nearest centroids of Q for each centroid of P.
 
-    Centroids xyz (C,n,3) and index arrays p, q (B,) -> (B,n,k). On a CPU by `group_knn`. On other
+    Centroids xyz (C,n,3) and index arrays p, q (B,) -> (B,n,k). Uses `group_knn` on a CPU. On other
     devices the search runs there, to avoid waiting for the CPU.
     """
     if xyz.device.type == "cpu":
@@ -418,16 +418,16 @@ KEYFRAME_DISTANCE, KEYFRAME_ANGLE = 5.0, 20.0  # [m], [deg] at which refinement 
 
 
 def augment(scans, T_pq, aligned, rng):
-    """Mirror half of the pairs left to right, then move every Q by a small random motion.
+    """Mirror pairs left to right with probability 1/2, then move every Q by a small random motion.
 
-    Takes the records of n scans P, then of their n scans Q, (2n,), and T_pq (n,4,4). Returns both
-    after augmentation. Where `aligned` (n,) is true, Q is first aligned with P by T_pq. A motion A
-    that takes each point q of Q to A q turns T_pq into T_pq A^-1. Not in the paper.
+    scans: records (2n,), first of n scans P and then of their n scans Q. T_pq: (n,4,4). Returns
+    both after augmentation. Where `aligned` (n,) is true, Q is first aligned with P by T_pq. A
+    motion A that takes each point q of Q to A q turns T_pq into T_pq A^-1. Not in the paper.
     """
     n = len(T_pq)
     mirror = np.where(rng.random((n, 1, 1)) < 0.5, np.diag([1.0, -1, 1, 1]), np.eye(4))
     T_pq = mirror @ T_pq @ mirror
-    scale = [0.25, 0.1, 0.03, 0.1, 0.1, 1.0]  # m, degrees; most in yaw: turns are rare
+    scale = [0.25, 0.1, 0.03, 0.1, 0.1, 1.0]  # m, degrees; largest in yaw, since turns are rare
     small = from_vector(rng.normal(size=(n, 6)) * scale)
     A = small @ np.where(aligned[:, None, None], T_pq, np.eye(4))
     return move_scans(scans, np.concatenate([mirror, A @ mirror])), T_pq @ invert(A)
@@ -851,7 +851,7 @@ def predict(net, scans, p, q, device):
 
 
 def mean_transform(transforms):
-    """Similar rigid transforms (n,4,4) -> their mean (4,4), also rigid."""
+    """Rigid transforms (n,4,4) that are close to each other -> their mean (4,4), also rigid."""
     transforms = np.stack(transforms)
     T = np.eye(4)
     T[:3, :3] = Rotation.from_matrix(transforms[:, :3, :3]).mean().as_matrix()
@@ -862,11 +862,10 @@ def mean_transform(transforms):
 def refine_pose(net, references, samplings, pose, device):
     """Refine the pose T_0q (4,4) of a scan Q with n samplings, records (n,). Returns T_0q.
 
-    references: a list of (samplings of an earlier scan P, records (n,), its pose T_0p). Each pass
-    uses one sampling and the next reference in turn. It aligns Q with P by the current estimate,
-    predicts the residual motion in both directions, and updates the estimate. The result is the
-    mean of all n estimates, because most of their error depends on which points were sampled. Not
-    in the paper.
+    references: a list of (records (n,), pose T_0p) of earlier scans P. Each pass uses one sampling
+    and the next reference in turn. It aligns Q with P using the current estimate, predicts the
+    residual motion in both directions, and updates the estimate. The result is the mean of all n
+    estimates, because most of their error depends on which points were sampled. Not in the paper.
     """
     estimates = []
     for k, q in enumerate(samplings):
@@ -1000,9 +999,9 @@ def relative_pose(scan_p: np.ndarray, scan_q: np.ndarray, weights: str | Path | 
 # ------------------------------------------------------------------------------------------------
 # 7  Evaluation: section 5
 
-BASELINES = "standing still", "mean motion of training"
+BASELINES = "standing still", "mean training motion"
 LEGEND = """E_t, E_r: KITTI's segments of 100 to 800 m, rectified left camera frame. t step, r step:
-mean translation and rotation of inv(T_est) @ T_true of a step, Velodyne frame. -: no such segment,
+mean translation and rotation of inv(T_est) @ T_true per step, Velodyne frame. -: no such segment,
 or no ground truth."""
 GEOMETRY_VERSION = 4  # increase it when `scan_geometry` changes, so that old caches are not read
 
@@ -1253,8 +1252,8 @@ def morton_order(xyz):
     """Sort points (N,3) so that close points are close in the order. Returns indices (N,).
 
     The order is a Z-order curve: each point's azimuth and log range are scaled to a byte, and the
-    bits of the two bytes are interleaved. In these coordinates a LiDAR's points are about evenly
-    dense. Affects speed only, never the result of `farthest_point_sampling`.
+    bits of the two bytes are interleaved. In these coordinates the points of a LiDAR have a nearly
+    uniform density. Affects speed only, never the result of `farthest_point_sampling`.
     """
     x, y = xyz[:, 0], xyz[:, 1]
     with np.errstate(all="ignore"):
@@ -1318,7 +1317,7 @@ def farthest_point_sampling(xyz: np.ndarray, n: int, start: int = 0) -> np.ndarr
 def batched_fps(clouds, n):
     """`farthest_point_sampling` of K clouds in one loop: (K,N,3) -> (K,n) indices, from index 0.
 
-    For small clouds most of the time is NumPy's overhead, which one loop for all clouds shares.
+    For small clouds NumPy's overhead dominates. One loop for all clouds incurs it only once.
     """
     (K, N), xyz = clouds.shape[:2], np.concatenate(clouds)  # (K*N,3)
     if K == 1:
@@ -1616,7 +1615,7 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
         per_epoch = steps_per_epoch(motions, net.config)
         geometry, fingerprints, test = training_geometry(chosen, held_out, net.config)
         if checkpoint and checkpoint["train"] != fingerprints:
-            raise ValueError(f"{run}: the data have changed since this training run started; "
+            raise ValueError(f"{run}: the data has changed since this training run started; "
                              "resume it with the data it was started with")
         facts = training_facts(fingerprints, motions, geometry, **earlier)
         names = list(fingerprints)
@@ -1806,7 +1805,7 @@ def eval_options(command):
     add("--weights", metavar="FILE|RUN", help=(
         "weights, or the folder of a training run (default: the pretrained weights)"))
     add("--refine", type=int, metavar="N", help=(
-        "not in the paper: refine each pose in N passes, each with a new sampling of the scan, "
+        "not in the paper: refine each pose in N passes, each with its own sampling of the scan, "
         "against a keyframe and the last scan in turn; 3 is recommended (default: 0)"))
     add("--device", help="cpu, cuda or mps (default: cpu)")
     add = command.add_argument_group("results").add_argument

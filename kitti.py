@@ -7,9 +7,9 @@ KITTI's pose files are in the frame of the rectified left camera. The points are
 frame, so `poses` and `motions()` of a sequence are, too: T_velo = inv(Tr) @ T_cam @ Tr.
 
 The simulated city can be used in place of KITTI: a car with an HDL-64E drives through 11 small
-cities, one for each sequence. There is oncoming, cross and same-direction traffic, and there are
-queues at lights, roundabouts, ramps and motorways. The ground truth is exact. All 11 sequences have
-2,620 scans and take 4.2 GB. Needs NumPy and SciPy.
+cities, one for each sequence. There is oncoming, cross and same-direction traffic with queues at
+lights, and there are roundabouts, ramps and motorways. The ground truth is exact. Together the 11
+sequences have 2,620 scans and take 4.2 GB. Needs NumPy and SciPy.
 
     python kitti.py simulate data/city
     python kitti.py simulate data/tiny --sequences 00 07 --scans 40 --azimuth 900
@@ -333,7 +333,7 @@ def scans_in(folder):
 
 
 def _notes_on_gaps(paths):
-    """A list with a line on scans that are missing, if the files are numbered one by one."""
+    """A list with a line on missing scans, if the files are numbered consecutively."""
     if not all(path.stem.isdecimal() for path in paths):
         return []
     steps = np.diff([int(path.stem) for path in paths])
@@ -495,7 +495,7 @@ def scan_stats(scan, centroids):
 
 
 def domain_shift(stats, seen):
-    """Name the statistics of a scan that differ from those in training by a factor above 1.5.
+    """Name the statistics of a scan outside the range in training by more than a factor of 1.5.
 
     stats: STATS (4,); seen (2,4): the smallest and largest values in training. Returns a text,
     empty if there are none.
@@ -855,7 +855,7 @@ def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int
     at the gaps, into sequences whose names end with -1, -2 ... Returns {name of a sequence:
     (number of its first scan in the drive, of its last)}.
 
-    A pose is that at the scan's time in velodyne_points/timestamps.txt: the middle of the
+    The pose of a scan is that at its time in velodyne_points/timestamps.txt, the middle of the
     revolution, when the scanner faces forward and triggers the cameras. The "sync" data is aligned
     to this time. The GPS/IMU packet of a scan was recorded at another time, 12 to 25 ms later in
     drive 0013. So the pose of the nearest packet is extrapolated to the scan's time with the
@@ -1033,7 +1033,7 @@ def _imu_poses(packets, nearest, delay):
 # ------------------------------------------------------------------------------------------------
 # The simulated city
 #
-# The world consists of vertical prisms, boxes and upright cylinders, on a raster of the ground. It
+# The world consists of vertical prisms (boxes and upright cylinders) on a raster of the ground. It
 # is built on flat land; hills are added to the finished points. Units are metres and radians, the
 # frame is x east, y north, z up. A prism is a row of 10 numbers:
 
@@ -1045,7 +1045,7 @@ ALBEDO = 7
 FUZZ = 8  # depth to which foliage lets light in; 0 for a solid
 ROUND = 9  # 1 for a cylinder, 0 for a box
 
-CITY = 4  # version; increase it when the city changes, so that scans of two are never mixed
+CITY = 4  # version; increase it when the city changes, so that scans of two versions never mix
 # Elevation of the 64 beams of an HDL-64E, from the lowest to the highest
 ELEVATION = np.radians(np.r_[np.linspace(-24.33, -8.83, 32), np.linspace(-8.33, 2.0, 32)])
 SENSOR_HEIGHT, MIN_RANGE, CITY_RANGE = 1.73, 2.5, 80.0
@@ -1060,11 +1060,11 @@ class _Style(NamedTuple):
     """How a sequence drives, and through which surroundings."""
 
     cruise: float  # cruising speed [m/s]
-    halts: int  # number of halts every 150 scans, in a queue at a light
+    halts: int  # number of halts per 150 scans, in a queue at a light
     lanes: int  # number of lanes in each direction
     reservation: float  # width of the central reservation; only motorways have one
-    # Odds of no junction, a street corner, a ramp and a roundabout every 35 to 80 m; these are
-    # farther apart above 15 m/s
+    # Odds of no junction, a street corner, a ramp and a roundabout every 35 to 80 m; the distance
+    # is larger above 15 m/s
     junctions: tuple
     odds: tuple  # of dense, suburban and open surroundings
 
@@ -1261,9 +1261,9 @@ def _prisms(*columns):
     return np.stack(np.broadcast_arrays(*arrays), axis=-1).reshape(-1, 10)
 
 
-# Car, van, lorry and bus: length and height, both from and to; half of the width; waist, which is
-# the height of the lower part; length of the upper part and how far it is moved back, in lengths of
-# the vehicle; its albedo compared with the lower part's, low where there are windows
+# Car, van, lorry and bus: length from, to; height from, to; half of the width; waist, which is the
+# height of the lower part; length of the upper part and its shift to the rear, both in lengths of
+# the vehicle; albedo of the upper part relative to the lower, low where there are windows
 VEHICLES = np.array([
     (3.6, 4.8, 1.4, 1.6, 0.88, 0.9, 0.58, 0.08, 0.6),
     (5.0, 6.5, 2.0, 2.8, 0.95, 1.1, 0.80, 0.10, 0.8),
@@ -1446,7 +1446,7 @@ def _ground(rng, drive, lanes, side_streets):
 
 
 def _leave_road_free(prisms, ground):
-    """Whether prisms (n,10) leave the road free, or are higher than a car as crowns are -> (n,)."""
+    """Which prisms (n,10) are off the road or, like crowns, higher than a car -> (n,) bool."""
     height, _, corner = ground
     x, y, yaw, half_x, half_y = prisms[:, [X, Y, YAW, HALF_X, HALF_Y]].T[:, :, None, None]
     along, across = half_x * np.linspace(-1, 1, 9)[:, None], half_y * np.linspace(-1, 1, 9)
@@ -1463,9 +1463,9 @@ def _leave_road_free(prisms, ground):
 def _lane_with_us(rng, drive, t, left):
     """Draw the vehicles of a lane in our direction: prisms (2,n,10), metres driven (n,scans).
 
-    Each does what the one before it does, a little later and some metres behind (Newell's model of
-    car following). All follow our own drive: they slow down in bends and queue at lights with us.
-    Vehicles to our left are faster than we are and those to our right slower, by 2 to 30 %.
+    Each does what the one ahead of it does, a little later and some metres behind (Newell's model
+    of car following). All follow our own drive: they slow down in bends and queue at lights with
+    us. Vehicles to our left are faster than we are and those to our right slower, by 2 to 30 %.
     """
     own = drive.distance(t)
     driven = own[-1] - own[0]
@@ -1481,7 +1481,7 @@ def _lane_with_us(rng, drive, t, left):
     wave, phase = rng.uniform(0.2, 0.6, (n, 1)), rng.uniform(0, 6.3, (n, 1))
     lead = lead + 0.25 * np.sin(wave * t + phase)  # (n,scans); distances are never quite constant
     s = own[0] + offset + rate * (drive.distance(t + lead) - own[0])
-    # Those before us in our lane stand on this side of the light, so the side street stays free
+    # Those ahead of us in our lane stand on this side of the light, so the side street stays free
     free = (offset + half < 25)[:, 0] | (left != 0)
     return vehicles[:, free], s[free]
 
@@ -1527,7 +1527,7 @@ def _traffic(rng, drive, t, lanes, side_streets, style):
 def _remove_collisions(x, y, yaw, seen, vehicles):
     """Remove vehicles that ever run into one before them in the list: set seen (n,scans) False.
 
-    To decide that, a vehicle is a row of five discs.
+    Vehicles are approximated by five discs in a row.
     """
     half_x, half_y = vehicles[0, :, HALF_X, None] + 0.2, vehicles[0, :, HALF_Y, None] + 0.1
     ends = np.linspace(-1, 1, 5)[:, None, None] * (half_x - half_y)
@@ -1568,11 +1568,11 @@ def _world(name, seed, scans):
             break
     drive = drive._replace(length=min(drive.length, s[-1] + 120))  # what is farther is not seen
     T = _sensor_poses(rng, drive, scans)
-    # How far to the left of our path the lanes in our and in the other direction are. We drive in
-    # one drawn at random, at 0.
+    # Offsets of the lanes to the left of our path, in our direction and in the other. Our own lane,
+    # drawn at random, is at 0.
     ours = (np.arange(style.lanes) - rng.integers(style.lanes)) * LANE
     lanes = ours, ours.max() + style.reservation + LANE * np.arange(1, style.lanes + 1)
-    # Side streets are at the light before every halt and elsewhere, where the road is straight
+    # Side streets are at the light ahead of every halt and elsewhere, where the road is straight
     at = np.r_[drive.halts + 30, rng.uniform(0, drive.length, int(drive.length / 120))]
     turn = drive.position(at + 8)[2] - drive.position(at - 8)[2]
     side_streets = at[(np.abs(turn) < 0.1) & (style.reservation == 0)]
@@ -1585,7 +1585,7 @@ def _world(name, seed, scans):
 
 
 def _is_measurable(drive, s):
-    """Whether a drive is long enough for segments of 100 m, and errors of rotation matter in it.
+    """Whether a drive is long enough for segments of 100 m and turns enough for rotation to matter.
 
     s (scans + 1,): distances along the road, 0.1 s apart.
     """
@@ -1926,7 +1926,7 @@ def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range
     The same arguments give the same bytes, no matter which other sequences are made. A sequence
     appears when it is complete. One that is there already, made with the same settings, is left as
     it is. Raises ValueError for arguments out of range, or when ROOT holds such a sequence from
-    elsewhere or with other settings, and OSError.
+    elsewhere or with other settings, and OSError if a file cannot be written.
     """
     root = Path(root)
     for name, value, least in (("seed", seed, 0), ("scans", scans, 1), ("azimuth", azimuth, 16),
@@ -1996,7 +1996,7 @@ def _command_line(argv):
     add("--scans", type=int, metavar="N", help=(
         "scans per sequence (default: 170 for test and validation, 320 for all others)"))
     add("--azimuth", type=int, metavar="N", default=1800, help=(
-        "rays per beam and turn (default: 1800)"))
+        "rays per beam and revolution (default: 1800)"))
 
     add = commands.add_parser("raw", help=(
         "convert a drive of KITTI's raw data, with ground truth")).add_argument

@@ -203,8 +203,8 @@ def segment_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
     complete = last < len(path)
     first, last, length = first[complete], last[complete], length[complete]  # (segments,)
 
-    # Our error transform is the inverse of the paper's, as in the devkit. The norm of its
-    # translation and the angle of its rotation are the same.
+    # Our error transform is the inverse of the paper's, as in the devkit. Both have the same length
+    # of translation and the same angle of rotation.
     delta_gt = np.linalg.inv(T_gt[first]) @ T_gt[last]  # (segments,4,4)
     delta_est = np.linalg.inv(T_est[first]) @ T_est[last]  # (segments,4,4)
     error = np.linalg.inv(delta_est) @ delta_gt  # (segments,4,4)

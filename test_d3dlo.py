@@ -2208,7 +2208,7 @@ def test_the_baselines_stand_still_or_repeat_the_mean_motion_of_training(cwd, ca
     save_weights("w.pt", SMALL, mean_motion=mean)
     assert d3dlo.main("eval --data root --weights w.pt --out out".split()) == 0
     out, results = capsys.readouterr().out, results_of("out")
-    for name, v in {"standing still": [0] * 6, "mean motion of training": mean}.items():
+    for name, v in {"standing still": [0] * 6, "mean training motion": mean}.items():
         motion = euler_pose(np.array(v))
         T = [np.linalg.matrix_power(motion, i) for i in range(15)]
         errors = np.linalg.inv(motion) @ s.motions()
