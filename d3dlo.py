@@ -10,9 +10,10 @@ Read this file beside the paper, from top to bottom:
     5  Weights files and devices
     6  Odometry                 eq. 1
     7  Evaluation               section 5
-    8  Faster versions of functions in parts 2 and 3. The code calls these, and they return the
+    8  Our additions            not in the paper: augmentation and refinement
+    9  Faster versions of functions in parts 2 and 3. The code calls these, and they return the
        same results up to rounding. To understand the method, read parts 2 and 3.
-    9  The command line
+    10 The command line
 
 kitti.py converts motions to the vectors of section 3.2 (`to_vector`), removes the ground plane
 (section 4), and loads or simulates the data. metrics.py computes E_t and E_r, eqs. 6 to 8. What
@@ -270,11 +271,11 @@ class Batch(NamedTuple):
 
 def make_batch(scans, p, q, config, device="cpu"):
     """Records of scans (C,) and index arrays p, q (B,) -> Batch. Torch needs int64 indices."""
-    indices = (scans[name].astype(np.int64) for name in ("idx_sa2", "idx_sa3"))
-    arrays = scans["xyz"], scans["group_sa1"], *indices, p, q
-    xyz, *others = (to_device(array, device) for array in arrays)
-    idx_fe = neighbours_in_q(xyz, p, q, config.fe.n_n)  # `group_knn` for every pair
-    return Batch(xyz, *others, idx_fe)
+    idx_sa2, idx_sa3 = scans["idx_sa2"].astype(np.int64), scans["idx_sa3"].astype(np.int64)
+    arrays = scans["xyz"], scans["group_sa1"], idx_sa2, idx_sa3, p, q
+    tensors = [to_device(array, device) for array in arrays]
+    idx_fe = neighbours_in_q(tensors[0], p, q, config.fe.n_n)  # `group_knn` for every pair
+    return Batch(*tensors, idx_fe)
 
 
 def neighbours_in_q(xyz, p, q, k):
@@ -400,49 +401,6 @@ class UnweightedLoss(nn.Module):
         return (y - y_hat).abs().mean()
 
 
-def move_scans(scans, T):
-    """Apply rigid motions or mirrors T (C,4,4) to the points in the records of C scans.
-
-    Distances do not change, so sampling and grouping stay valid.
-    """
-    moved, T = scans.copy(), T.astype(np.float32)
-    R_T, t = T[:, :3, :3].transpose(0, 2, 1), T[:, None, :3, 3]
-    moved["xyz"] = scans["xyz"] @ R_T + t  # R x + t, with points as rows
-    offsets = scans["group_sa1"][..., 1:]  # (C,n1,k1,3)
-    moved["group_sa1"][..., 1:] = (offsets.reshape(len(T), -1, 3) @ R_T).reshape(offsets.shape)
-    return moved
-
-
-ALIGNED = 1 / 3  # with augmentation, the share of pairs in which Q is first aligned with P
-KEYFRAME_DISTANCE, KEYFRAME_ANGLE = 5.0, 20.0  # [m], [deg] at which refinement takes a new keyframe
-
-
-def augment(scans, T_pq, aligned, rng):
-    """Mirror pairs left to right with probability 1/2, then move every Q by a small random motion.
-
-    scans: records (2n,), first of n scans P and then of their n scans Q. T_pq: (n,4,4). Returns
-    both after augmentation. Where `aligned` (n,) is true, Q is first aligned with P by T_pq. A
-    motion A that takes each point q of Q to A q turns T_pq into T_pq A^-1. Not in the paper.
-    """
-    n = len(T_pq)
-    mirror = np.where(rng.random((n, 1, 1)) < 0.5, np.diag([1.0, -1, 1, 1]), np.eye(4))
-    T_pq = mirror @ T_pq @ mirror
-    scale = [0.25, 0.1, 0.03, 0.1, 0.1, 1.0]  # m, degrees; largest in yaw, since turns are rare
-    small = from_vector(rng.normal(size=(n, 6)) * scale)
-    A = small @ np.where(aligned[:, None, None], T_pq, np.eye(4))
-    return move_scans(scans, np.concatenate([mirror, A @ mirror])), T_pq @ invert(A)
-
-
-def later_scan(motions, i, rng):
-    """Draw the index of a scan up to KEYFRAME_DISTANCE metres farther along the path than scan i.
-
-    motions: T_{t,t+1} (n-1,4,4) of the sequence. The result is at least i + 1, even if that scan is
-    farther.
-    """
-    ahead = np.cumsum(np.linalg.norm(motions[i:, :3, 3], axis=1))  # distance to i+1, i+2, ... [m]
-    return i + max(1, np.searchsorted(ahead, rng.uniform(0, KEYFRAME_DISTANCE), "right"))
-
-
 def training_batch(geometry, motions, pairs, config, rng, device="cpu"):
     """`pairs` (n,2), each a sequence index s and a scan index i -> Batch and its T_pq (B,4,4).
 
@@ -451,19 +409,22 @@ def training_batch(geometry, motions, pairs, config, rng, device="cpu"):
     """
     n = len(pairs)
     aligned = rng.random(n) < ALIGNED if config.augment else np.zeros(n, bool)
-    later = [later_scan(motions[s], i, rng) if a else i + 1 for (s, i), a in zip(pairs, aligned)]
-    scans = np.stack([geometry[s][i] for s, i in pairs]
-                     + [geometry[s][j] for (s, _), j in zip(pairs, later)])  # all P, then all Q
-    T_pq = np.stack([functools.reduce(np.matmul, motions[s][i:j])
-                     for (s, i), j in zip(pairs, later)])
+    scans_p, scans_q, T_pq = [], [], []
+    for (s, i), several_apart in zip(pairs, aligned):
+        j = later_scan(motions[s], i, rng) if several_apart else i + 1
+        scans_p.append(geometry[s][i])
+        scans_q.append(geometry[s][j])
+        T_pq.append(functools.reduce(np.matmul, motions[s][i:j]))  # T_{i,i+1} ... T_{j-1,j}
+    scans, T_pq = np.stack(scans_p + scans_q), np.stack(T_pq)  # all P, then all Q
     if config.augment:
         scans, T_pq = augment(scans, T_pq, aligned, rng)
-    p, q, T_qp = np.arange(n), np.arange(n) + n, invert(T_pq)
-    # Both directions of every pair, (P, Q) with T_pq and (Q, P) with its inverse
-    p, q, T = np.concatenate([p, q]), np.concatenate([q, p]), np.concatenate([T_pq, T_qp])
-    if config.swap == "random":  # section 4: one of the two
-        one = np.where(rng.random(n) < 0.5, np.arange(n), np.arange(n) + n)
-        p, q, T = p[one], q[one], T[one]
+    p, q, T_qp = np.arange(n), np.arange(n, 2 * n), invert(T_pq)
+    if config.swap == "both":
+        p, q, T = np.r_[p, q], np.r_[q, p], np.concatenate([T_pq, T_qp])
+    else:  # section 4: swap P and Q at random, and invert the motion
+        swapped = rng.random(n) >= 0.5
+        p, q = np.where(swapped, q, p), np.where(swapped, p, q)
+        T = np.where(swapped[:, None, None], T_qp, T_pq)
     return make_batch(scans, p, q, config, device), T
 
 
@@ -850,58 +811,6 @@ def predict(net, scans, p, q, device):
     return net.decode(y_hat)
 
 
-def mean_transform(transforms):
-    """Rigid transforms (n,4,4) that are close to each other -> their mean (4,4), also rigid."""
-    transforms = np.stack(transforms)
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_matrix(transforms[:, :3, :3]).mean().as_matrix()
-    T[:3, 3] = transforms[:, :3, 3].mean(0)
-    return T
-
-
-def refine_pose(net, references, samplings, pose, device):
-    """Refine the pose T_0q (4,4) of a scan Q with n samplings, records (n,). Returns T_0q.
-
-    references: a list of (records (n,), pose T_0p) of earlier scans P. Each pass uses one sampling
-    and the next reference in turn. It aligns Q with P using the current estimate, predicts the
-    residual motion in both directions, and updates the estimate. The result is the mean of all n
-    estimates, because most of their error depends on which points were sampled. Not in the paper.
-    """
-    estimates = []
-    for k, q in enumerate(samplings):
-        samplings_p, T_0p = references[k % len(references)]
-        T = invert(T_0p) @ pose  # the current estimate of T_pq
-        aligned, = move_scans(q[None], T[None])
-        pair = np.stack([samplings_p[k], aligned])
-        T_pq, T_qp = predict(net, pair, np.array([0, 1]), np.array([1, 0]), device)
-        pose = T_0p @ mean_transform([T_pq, invert(T_qp)]) @ T
-        estimates.append(pose)
-    return mean_transform(estimates)
-
-
-def several_samplings(scan, config, n):
-    """Sample a scan n times: (N,4) -> records (n,), see `scan_geometry`. Not in the paper.
-
-    Sampling k takes its centroids from points k, k + n, k + 2n, ..., so no two samplings share a
-    centroid. A scan with fewer than n * n1 usable points is split into fewer parts, so some
-    samplings are then identical. Neighbours are searched in the whole scan.
-    """
-    scan, broken = usable_scan(scan, config)
-    cloud = np.ascontiguousarray(scan[:, :3])
-    parts = min(n, len(cloud) // config.sa1.n_fps)
-    size = len(cloud) // parts
-    clouds = cloud[:size * parts].reshape(size, parts, 3).swapaxes(0, 1)  # (parts,size,3)
-    with ThreadPoolExecutor(2) as threads:
-        tree = threads.submit(build_tree, cloud)  # while the main thread samples
-        centroids = batched_fps(clouds, config.sa1.n_fps) * parts  # (parts,n1)
-        centroids += np.arange(parts)[:, None]
-
-        def group(k):
-            return group_scan(scan, broken, centroids[k % parts], tree.result(), config)
-
-        return np.stack([*threads.map(group, range(n))])
-
-
 def predict_motions(net, records, device="cpu", batch=16):
     """Records of consecutive scans (n,) -> T_{t,t+1} (n-1,4,4), Velodyne frame."""
     motions = [np.empty((0, 4, 4))]
@@ -937,13 +846,12 @@ class Odometry:
             raise ValueError(f"refine must be at most {MAX_REFINE} passes, not {refine}")
         net, self.facts = load_weights(weights, network)
         self.net, self.device, self.refine = for_device(net, device), device, refine
-        self.seen = self.facts["seen"]  # range of the scan statistics in training
+        self.warned = False  # about scans unlike those in training
         self.restart()
 
     def restart(self):
         """Forget all scans. The next one defines the frame of the poses."""
-        self.pose, self.last = np.eye(4), None  # of the last scan: its pose, its records
-        self.keyframe = None  # records and pose
+        self.last = self.keyframe = None  # records and pose of the last scan and of a keyframe
 
     def register(self, scan: np.ndarray) -> np.ndarray:
         """Scan (N,4): x, y, z [m], intensity 0 to 1 -> its pose T_0t (4,4), Velodyne frame.
@@ -956,32 +864,29 @@ class Odometry:
         if records[0]["broken"]:
             warnings.warn(f"dropped {records[0]['broken']} {INVALID_POINTS}", stacklevel=2)
         pose = self.register_records(records)
-        if self.seen and (shift := kitti.domain_shift(records[0]["stats"], self.seen)):
+        shift = kitti.domain_shift(records[0]["stats"], self.facts["seen"])
+        if shift and not self.warned:
             warnings.warn(f"{SHIFT_WARNING}: {shift}", stacklevel=2)
-            self.seen = None  # warn once
+            self.warned = True
         return pose
 
     def register_records(self, records):
         """`register` for a scan that is sampled already: records (max(refine, 1),) -> its pose."""
-        pose = self.pose
-        if self.last is not None:  # eq. 1
-            motion, = predict_motions(self.net, np.stack([self.last[0], records[0]]), self.device)
-            pose = pose @ motion
+        pose = np.eye(4)
+        if self.last:
+            last_records, last_pose = self.last
+            pair = np.stack([last_records[0], records[0]])
+            T_pq, = predict_motions(self.net, pair, self.device)
+            pose = last_pose @ T_pq  # eq. 1
         # Refine the pose against a keyframe, an earlier scan that is replaced every few metres, and
         # the last scan. Errors then add up from keyframe to keyframe, not from scan to scan.
-        if self.keyframe is not None:
-            references = [self.keyframe, (self.last, self.pose)]
+        if self.refine and self.keyframe:
+            references = [self.keyframe, self.last]
             pose = refine_pose(self.net, references, records, pose, self.device)
-        if self.refine and (self.keyframe is None or is_far(invert(self.keyframe[1]) @ pose)):
+        if self.refine and (not self.keyframe or is_far(invert(self.keyframe[1]) @ pose)):
             self.keyframe = records, pose
-        self.pose, self.last = pose, records
+        self.last = records, pose
         return pose.copy()
-
-
-def is_far(T):
-    """Whether a scan at the pose T (4,4) relative to the keyframe becomes the next keyframe."""
-    angle = np.degrees(Rotation.from_matrix(T[:3, :3]).magnitude())
-    return np.linalg.norm(T[:3, 3]) >= KEYFRAME_DISTANCE or angle >= KEYFRAME_ANGLE
 
 
 def relative_pose(scan_p: np.ndarray, scan_q: np.ndarray, weights: str | Path | None = None,
@@ -1238,7 +1143,108 @@ def zip_for_server(out):
 
 
 # ------------------------------------------------------------------------------------------------
-# 8  Faster versions of functions in parts 2 and 3
+# 8  Our additions, not in the paper: augmentation and refinement
+
+
+def move_scans(scans, T):
+    """Apply rigid motions or mirrors T (C,4,4) to the points in the records of C scans.
+
+    Distances do not change, so sampling and grouping stay valid.
+    """
+    moved, T = scans.copy(), T.astype(np.float32)
+    R_T, t = T[:, :3, :3].transpose(0, 2, 1), T[:, None, :3, 3]
+    moved["xyz"] = scans["xyz"] @ R_T + t  # R x + t, with points as rows
+    offsets = scans["group_sa1"][..., 1:]  # (C,n1,k1,3)
+    moved["group_sa1"][..., 1:] = (offsets.reshape(len(T), -1, 3) @ R_T).reshape(offsets.shape)
+    return moved
+
+
+ALIGNED = 1 / 3  # with augmentation, the share of pairs in which Q is first aligned with P
+KEYFRAME_DISTANCE, KEYFRAME_ANGLE = 5.0, 20.0  # [m], [deg] at which refinement takes a new keyframe
+
+
+def augment(scans, T_pq, aligned, rng):
+    """Mirror pairs left to right with probability 1/2, then move every Q by a small random motion.
+
+    scans: records (2n,), first of n scans P and then of their n scans Q. T_pq: (n,4,4). Returns
+    both after augmentation. Where `aligned` (n,) is true, Q is first aligned with P by T_pq. A
+    motion A that takes each point q of Q to A q turns T_pq into T_pq A^-1. Not in the paper.
+    """
+    n = len(T_pq)
+    mirror = np.where(rng.random((n, 1, 1)) < 0.5, np.diag([1.0, -1, 1, 1]), np.eye(4))
+    T_pq = mirror @ T_pq @ mirror
+    scale = [0.25, 0.1, 0.03, 0.1, 0.1, 1.0]  # m, degrees; largest in yaw, since turns are rare
+    small = from_vector(rng.normal(size=(n, 6)) * scale)
+    A = small @ np.where(aligned[:, None, None], T_pq, np.eye(4))
+    return move_scans(scans, np.concatenate([mirror, A @ mirror])), T_pq @ invert(A)
+
+
+def later_scan(motions, i, rng):
+    """Draw the index of a scan up to KEYFRAME_DISTANCE metres farther along the path than scan i.
+
+    motions: T_{t,t+1} (n-1,4,4) of the sequence. The result is at least i + 1, even if that scan is
+    farther.
+    """
+    ahead = np.cumsum(np.linalg.norm(motions[i:, :3, 3], axis=1))  # distance to i+1, i+2, ... [m]
+    return i + max(1, np.searchsorted(ahead, rng.uniform(0, KEYFRAME_DISTANCE), "right"))
+
+
+def mean_transform(transforms):
+    """Rigid transforms (n,4,4) that are close to each other -> their mean (4,4), also rigid."""
+    transforms = np.stack(transforms)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_matrix(transforms[:, :3, :3]).mean().as_matrix()
+    T[:3, 3] = transforms[:, :3, 3].mean(0)
+    return T
+
+
+def refine_pose(net, references, samplings, pose, device):
+    """Refine the pose T_0q (4,4) of a scan Q with n samplings, records (n,). Returns T_0q.
+
+    references: a list of (records (n,), pose T_0p) of earlier scans P. Each pass uses one sampling
+    and the next reference in turn. It aligns Q with P using the current estimate, predicts the
+    residual motion in both directions, and updates the estimate. The result is the mean of all n
+    estimates, because most of their error depends on which points were sampled. Not in the paper.
+    """
+    estimates = []
+    for k, q in enumerate(samplings):
+        samplings_p, T_0p = references[k % len(references)]
+        T = invert(T_0p) @ pose  # the current estimate of T_pq
+        aligned, = move_scans(q[None], T[None])
+        pair = np.stack([samplings_p[k], aligned])
+        T_pq, T_qp = predict(net, pair, np.array([0, 1]), np.array([1, 0]), device)
+        pose = T_0p @ mean_transform([T_pq, invert(T_qp)]) @ T
+        estimates.append(pose)
+    return mean_transform(estimates)
+
+
+def several_samplings(scan, config, n):
+    """Sample a scan n times: (N,4) -> records (n,), see `scan_geometry`. Not in the paper.
+
+    Sampling k takes its centroids from points k, k + n, k + 2n, ..., so no two samplings share a
+    centroid. A scan with fewer than n * n1 usable points is split into fewer parts, so some
+    samplings are then identical. Neighbours are searched in the whole scan.
+    """
+    scan, broken = usable_scan(scan, config)
+    cloud = np.ascontiguousarray(scan[:, :3])
+    parts = min(n, len(cloud) // config.sa1.n_fps)
+    size = len(cloud) // parts
+    clouds = cloud[:size * parts].reshape(size, parts, 3).swapaxes(0, 1)  # (parts,size,3)
+    centroids = batched_fps(clouds, config.sa1.n_fps) * parts  # (parts,n1)
+    centroids += np.arange(parts)[:, None]
+    tree = build_tree(cloud)
+    return np.stack([group_scan(scan, broken, centroids[k % parts], tree, config)
+                     for k in range(n)])
+
+
+def is_far(T):
+    """Whether a scan at the pose T (4,4) relative to the keyframe becomes the next keyframe."""
+    angle = np.degrees(Rotation.from_matrix(T[:3, :3]).magnitude())
+    return np.linalg.norm(T[:3, 3]) >= KEYFRAME_DISTANCE or angle >= KEYFRAME_ANGLE
+
+
+# ------------------------------------------------------------------------------------------------
+# 9  Faster versions of functions in parts 2 and 3
 #
 # Tests check that every function equals its plain form, up to rounding. On a CPU most of the time
 # goes into memory traffic, so these functions avoid large arrays.
@@ -1520,7 +1526,7 @@ def linear_norm_relu_max(linear, norm, h):
 
 
 # ------------------------------------------------------------------------------------------------
-# 9  The command line
+# 10  The command line
 
 SIMULATED = Path("data/simulated")  # the simulated city, used without --data
 

@@ -2055,7 +2055,7 @@ def test_train_stores_a_run_that_eval_reads_and_nothing_overwrites(cwd, city, ca
     fails_with_one_line(d3dlo.main, arguments, "--resume", capsys)  # not overwritten
     shutil.copy("data/poses/07.txt", "data/poses/00.txt")
     resume = "train --out run --resume".split()
-    fails_with_one_line(d3dlo.main, resume, "the data have changed", capsys)
+    fails_with_one_line(d3dlo.main, resume, "the data has changed", capsys)
     assert (run / "checkpoint.pt").read_bytes() == before
     arguments = "eval --data data --weights run/checkpoint.pt".split()
     fails_with_one_line(d3dlo.main, arguments, "weights.pt beside", capsys)
@@ -2256,7 +2256,7 @@ def test_a_run_is_not_resumed_after_a_scan_has_changed(cwd, capsys):
     root = write_root(cwd / "root", size=60)
     d3dlo.train(replace(SMALL, epochs=1), "root", out="run")
     change_in_the_middle(root / SCAN)
-    fails_with_one_line(d3dlo.main, "train --out run --resume".split(), "data have changed", capsys)
+    fails_with_one_line(d3dlo.main, "train --out run --resume".split(), "data has changed", capsys)
 
 
 def test_train_fails_with_one_line_when_the_loss_diverges(cwd, capsys):
