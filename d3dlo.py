@@ -757,7 +757,14 @@ def load_weights(path: str | Path | None = None, network=D3DLO, checkpoint: bool
     return net.eval(), state
 
 
-# Devices
+# Arguments and devices
+
+
+def check_number(name, value):
+    """Raise ValueError unless a value is a non-negative integer of at most 63 bits."""
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not (whole and 0 <= value < 2**63):
+        raise ValueError(f"{name} must be a non-negative integer, not {value!r}")
 
 
 def check_device(device):
@@ -1531,13 +1538,6 @@ def linear_norm_relu_max(linear, norm, h):
 SIMULATED = Path("data/simulated")  # the simulated city, used without --data
 
 
-def check_number(name, value):
-    """Raise ValueError unless a value is a non-negative integer of at most 63 bits."""
-    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not (whole and 0 <= value < 2**63):
-        raise ValueError(f"{name} must be a non-negative integer, not {value!r}")
-
-
 def check_output(path, root):
     """Raise ValueError unless `path` can be a folder of results outside the data in `root`."""
     path, root = Path(path).resolve(), Path(root).resolve()
@@ -1553,10 +1553,10 @@ def data_root(data, names, whole=False):
     Missing sequences of the city are simulated: those in `names`, or all if `whole`. Raises
     ValueError for a name that the city does not have.
     """
-    names = [names] if isinstance(names, str) else names or ()
     if data:
         return Path(data)
-    if unknown := set(names) - {"all", *SPLITS, *sum(SPLITS.values(), ())}:
+    names = kitti.expand_splits(names or ())
+    if unknown := set(names) - set(kitti.expand_splits("all")):
         raise ValueError(f"the simulated city has no sequence {' '.join(sorted(unknown))}; "
                          f"available: 00 to 10, {', '.join(SPLITS)}, all")
     return kitti.simulate(SIMULATED, sequences="all" if whole else names)
@@ -1612,7 +1612,7 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
         elif (run / "config.json").exists():
             raise ValueError(f"{run}: holds a training run; add --resume to continue it, or choose "
                              "another --out")
-        config = config or config_from({"data": data})
+        config = config or (Config() if data else Config(**SHORT))
         data, weights = (path and str(Path(path).resolve()) for path in (data, weights))
         net, checkpoint, earlier = starting_point(run, resume, weights, config, network, seed)
         root = data_root(data, sequences, whole=True)

@@ -416,11 +416,11 @@ def sequence_names(root: str | Path) -> list[str]:
     return names
 
 
-def open_sequences(root: str | Path, names: str | list[str] | None = None) -> list[Sequence]:
+def open_sequences(root: str | Path, names: str | list[str] = "all") -> list[Sequence]:
     """Open sequences of ROOT, in the order given, each once.
 
-    names: one or several names of folders under ROOT/sequences, splits of SPLITS, or "all"; None
-    means "all". Sequences of a split that ROOT lacks are skipped. A ROOT without a folder
+    names: one or several names of folders under ROOT/sequences, splits of SPLITS, or "all".
+    Sequences of a split that ROOT lacks are skipped. A ROOT without a folder
     sequences/ is one `ScanFolder`. Raises ValueError for a name or split with no sequence in ROOT,
     and the errors of `sequence_names`, `Sequence` and `ScanFolder`.
     """
@@ -432,10 +432,7 @@ def open_sequences(root: str | Path, names: str | list[str] | None = None) -> li
     for name in available:
         choices[name] = [name]
 
-    if names is None:
-        names = ["all"]
-    elif isinstance(names, str):
-        names = [names]
+    names = [names] if isinstance(names, str) else names
     chosen = {}  # a dict keeps the order
     for name in names:
         if not choices.get(name):
@@ -1053,7 +1050,7 @@ LANE = 3.5  # width of a lane
 SIDE_STREET = 70.0  # how far a side street goes on both sides of the road
 CELL = 0.5  # size of a cell of the ground
 RELIEF = 0.4  # depth of windows and doors, in prisms higher than 3 m
-DENSE, SUBURBAN, OPEN = 0, 1, 2  # surroundings
+DENSE = 0  # of the surroundings 0 dense, 1 suburban and 2 open
 
 
 class _Style(NamedTuple):
@@ -1776,11 +1773,28 @@ def _simulate_scan(name, seed, scans, azimuth, i):
     rays = _Rays(world.T_flat[i, :3, :3], azimuth, rng)
     hits = _hit_prisms(np.concatenate([world.prisms, world.moving(i)]), eye, rays, rng)
     _hit_ground(hits, world.ground, eye, rays)
+    ray, r, intensity = _returns(hits, eye, rays, rng)  # (N,) each
 
+    # Points relative to the eye along the axes of the world. The hills lift them: a crest does not
+    # hide anything.
+    d, col = r * rays.cos_w[ray], ray % azimuth
+    x, y, z = d * rays.cos_a[col], d * rays.sin_a[col], r * rays.sin_w[ray]
+    lift = world.height(x + f4(eye[0]), y + f4(eye[1])) - world.height(*eye[:2])
+    z += lift.astype(f4)
+    # Rotate them by R^T to the sensor's axes; without BLAS, whose sums depend on its threads
+    points = [x * row[0] + y * row[1] + z * row[2] for row in R.T.astype(f4)]
+    return np.stack([*points, intensity], axis=1)  # (N,4)
+
+
+def _returns(hits, eye, rays, rng):
+    """What the sensor measures of the `hits` of all rays.
+
+    Returns indices of the rays that return a point, their ranges [m] and intensities, (N,) each.
+    """
+    f4 = np.float32
     ray = np.flatnonzero(hits[0] < CITY_RANGE)  # (M,)
-    col = ray % azimuth
+    col = ray % len(rays.cos_a)
     d, cosine, albedo, depth = hits[:, ray]  # (M,) each
-    cos_a, sin_a = rays.cos_a[col], rays.sin_a[col]
 
     def noise():
         return rng.standard_normal(len(ray), dtype=f4)
@@ -1790,7 +1804,7 @@ def _simulate_scan(name, seed, scans, azimuth, i):
 
     # Range. Light gets into foliage, or into the windows and doors of a facade, by a depth that is
     # random for each cell of 0.6 m but the same in every scan.
-    directions = cos_a, sin_a, rays.slope[ray]  # for each metre in plan
+    directions = rays.cos_a[col], rays.sin_a[col], rays.slope[ray]  # for each metre in plan
     a, b, c = (np.floor((start + d * direction) / 0.6).astype(np.int64)  # number of the cell
                for start, direction in zip(eye, directions))
     rough = ((a * 73856093 ^ b * 19349663 ^ c * 83492791) % 1009).astype(f4) / 1009  # 0 to 1
@@ -1805,19 +1819,8 @@ def _simulate_scan(name, seed, scans, azimuth, i):
     far = 0.10 * (r / 40) ** 2 * (0.15 / (0.05 + albedo))
     lost = 0.01 + far + 0.3 * np.exp(-cosine / 0.02) + 0.5 * np.exp(-albedo / 0.03)
     returned = (uniform() > lost) & (r < CITY_RANGE) & (r > MIN_RANGE)
-    ray, r, light = ray[returned], r[returned], light[returned]
-    cos_a, sin_a = cos_a[returned], sin_a[returned]
-
-    # Points relative to the eye along the axes of the world. The hills lift them: a crest does not
-    # hide anything.
-    d = r * rays.cos_w[ray]
-    x, y, z = d * cos_a, d * sin_a, r * rays.sin_w[ray]
-    lift = world.height(x + f4(eye[0]), y + f4(eye[1])) - world.height(*eye[:2])
-    z += lift.astype(f4)
-    # Rotate them by R^T to the sensor's axes; without BLAS, whose sums depend on its threads
-    points = [x * row[0] + y * row[1] + z * row[2] for row in R.T.astype(f4)]
     intensity = np.round(np.clip(light, 0, 0.99), 2)
-    return np.stack([*points, intensity], axis=1)  # (N,4)
+    return ray[returned], r[returned], intensity[returned]
 
 
 # Writing sequences
@@ -1852,7 +1855,7 @@ def _calibration():
     return Tr, "".join(lines)
 
 
-def _expand_splits(sequences):
+def expand_splits(sequences):
     """Names of sequences and splits -> names of sequences, each once."""
     names = [sequences] if isinstance(sequences, str) else sequences
     expanded = {}  # a dict keeps the order
@@ -1914,14 +1917,14 @@ def _finish_sequence(temporary, folder, settings, calib):
             raise
 
 
-def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range(11)), scans=None,
-             azimuth=1800, workers=None) -> Path:
+def simulate(root: str | Path, seed=0, sequences="all", scans=None, azimuth=1800,
+             workers=None) -> Path:
     """Simulate an HDL-64E that drives through a city for each sequence, with exact ground truth.
 
     Writes ROOT in KITTI's odometry layout and returns it. seed: another one gives other cities;
     sequences: names, splits or "all"; scans: number per sequence (None: 170 for test and
     validation, which drive more than 115 m, and 320 for all others); azimuth: rays per beam and
-    turn; workers: processes (None: one per core).
+    revolution; workers: processes (None: one per core).
 
     The same arguments give the same bytes, no matter which other sequences are made. A sequence
     appears when it is complete. One that is there already, made with the same settings, is left as
@@ -1933,7 +1936,7 @@ def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range
                                ("workers", workers, 1)):
         if value is not None and (value != int(value) or value < least):
             raise ValueError(f"{name} is {value} but must be a whole number, {least} or more.")
-    missing = _missing_sequences(root, _expand_splits(sequences), seed, scans, azimuth)
+    missing = _missing_sequences(root, expand_splits(sequences), seed, scans, azimuth)
     folders = {name: root / "sequences" / name for name in missing}
     Tr, calib = _calibration()
 
@@ -1945,11 +1948,10 @@ def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range
     for name, folder in temporary.items():
         for i in range(missing[name]["scans"]):
             tasks.append((folder / "velodyne" / f"{i:06d}.bin", name, missing[name], i))
-    in_pool = (workers or cores()) > 1 and len(tasks) > 8
-    if in_pool:
+    if (workers or cores()) > 1 and len(tasks) > 8:
         saved = in_processes(_save_scan, tasks, workers, chunksize=8)
     else:
-        saved = map(_save_scan, tasks)
+        saved = (_save_scan(task) for task in tasks)
     try:
         for folder in temporary.values():
             shutil.rmtree(folder, ignore_errors=True)  # left by an earlier process with the same id
@@ -1969,8 +1971,7 @@ def simulate(root: str | Path, seed=0, sequences=tuple(f"{i:02d}" for i in range
             write_poses(root / "poses" / f"{name}.txt", T_cam)
         next(made, None)  # lets the progress line end
     finally:
-        if in_pool:
-            saved.close()
+        saved.close()
         for folder in temporary.values():
             shutil.rmtree(folder, ignore_errors=True)
     return root

@@ -545,12 +545,11 @@ def count_scans(root, names):
 
     Returns {sequence: number of scans}, and a list of those that `names` mean.
     """
-    splits = kitti.SPLITS | {"all": sum(kitti.SPLITS.values(), ())}
-    scans = {name: kitti.default_scans(name) for name in sorted(splits["all"])}
-    chosen = sum((splits.get(name, (name,)) for name in names), ())
+    scans = {name: kitti.default_scans(name) for name in sorted(kitti.expand_splits("all"))}
+    chosen = kitti.expand_splits(names)
     if unknown := set(chosen) - set(scans):
         raise ValueError(f"{root}: the simulated city has no sequence {' '.join(sorted(unknown))}")
-    return scans, list(dict.fromkeys(chosen))
+    return scans, chosen
 
 
 def main():
@@ -560,8 +559,8 @@ def main():
     args = command_line()
     signal.signal(signal.SIGTERM, stop_children)
     root = Path(args.data or d3dlo.SIMULATED)
-    names = sum(kitti.SPLITS.values(), ())
-    complete = all((root / "poses" / f"{name}.txt").exists() for name in names)
+    complete = all((root / "poses" / f"{name}.txt").exists()
+                   for name in kitti.expand_splits("all"))
     if args.dry_run and not args.data and not complete:  # count, but do not simulate
         sequences, (scans, trained) = [], count_scans(root, args.sequences)
     else:
