@@ -1776,8 +1776,9 @@ def test_refined_poses_stay_rigid_in_a_long_drive(tmp_path):
     assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
 
 
-@pytest.mark.parametrize("refine", [-1, 1.5, "1", None, float("nan")])
+@pytest.mark.parametrize("refine", [-1, 1.5, "1", None, float("nan"), True])
 def test_an_invalid_number_of_refinements_is_refused(weights, refine):
+    assert d3dlo.Odometry(weights, refine=np.int64(2)).refine == 2
     scan = np.ones((2000, 4), np.float32)
     for call in (lambda: d3dlo.Odometry(weights, refine=refine),
                  lambda: d3dlo.relative_pose(scan, scan, weights, refine),
@@ -2364,13 +2365,6 @@ def test_bad_data_fails_with_one_line_and_leaves_no_files(cwd, weights, capsys, 
     for arguments in (evaluate, train):
         fails_with_one_line(d3dlo.main, arguments, words, capsys)
     assert [name for name in files_of(cwd) if not name.startswith("root/")] == []
-
-
-def test_refine_takes_whole_numbers_of_numpy_but_not_booleans():
-    assert d3dlo.Odometry(refine=np.int64(2)).refine == 2
-    for wrong in (True, 1.0, "1", -1):
-        with pytest.raises(ValueError, match="refine must be a non-negative integer"):
-            d3dlo.Odometry(refine=wrong)
 
 
 @pytest.mark.parametrize("T", [np.eye(4), np.zeros((3, 3, 4)), np.zeros((2, 4, 3))])
