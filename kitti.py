@@ -43,7 +43,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from metrics import path_lengths, read_poses, replacing, temporary_beside, write_poses
+from metrics import is_rigid, path_lengths, read_poses, replacing, temporary_beside, write_poses
 
 try:
     import fcntl
@@ -130,7 +130,7 @@ def read_calib(path: str | Path) -> np.ndarray:
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: {remedy}.")
     row = _calib_row(path, "Tr", 12).reshape(3, 4)
-    if not _is_rigid(row):
+    if not is_rigid(row):
         raise ValueError(f"{path} has no row 'Tr' (Velodyne to camera) of 12 finite numbers, a "
                          f"rotation and a translation: {remedy}.")
     return np.vstack([row, [0, 0, 0, 1]])  # (4,4)
@@ -143,15 +143,6 @@ def _calib_row(path, name, count):
         return np.array(rows[0].split(), dtype=float).reshape(count)
     except (IndexError, ValueError):
         return np.full(count, np.nan)
-
-
-def _is_rigid(row):
-    """Whether `row` (3,4) is finite and its first three columns are a rotation."""
-    R = row[:, :3]
-    with np.errstate(all="ignore"):  # huge numbers overflow
-        deviation = np.abs(R @ R.T - np.eye(3)).max()
-        rotation = deviation < 1e-3 and np.linalg.det(R) > 0
-    return bool(np.isfinite(row).all() and rotation)
 
 
 def write_tum(path: str | Path, T: np.ndarray, times: np.ndarray) -> None:
@@ -989,7 +980,7 @@ def _raw_calib(folder, archive):
         R = _calib_row(path, rotation, 9).reshape(3, 3)
         t = _calib_row(path, translation, 3) if translation else np.zeros(3)
         row = np.column_stack([R, t])  # (3,4)
-        if not _is_rigid(row):
+        if not is_rigid(row):
             raise ValueError(f"{path} is damaged: its row {rotation!r} should hold a rotation, "
                              f"and 'T' a translation; unpack {archive} again.")
         return np.vstack([row, [0, 0, 0, 1]])  # (4,4)

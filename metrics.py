@@ -137,14 +137,20 @@ def read_poses(path: str | Path) -> np.ndarray:
             raise ValueError(f"{path}, line {number}: {len(words)} words, but a KITTI pose is 12 "
                              "finite numbers; correct the line")
 
-    R = T[:, :3, :3]
-    with np.errstate(all="ignore"):  # huge numbers overflow
-        deviation = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max((1, 2))  # (n,)
-        rigid = (deviation < 1e-2) & (np.linalg.det(R) > 0)
+    rigid = is_rigid(T)
     if not rigid.all():
         raise ValueError(f"{path}: pose {np.argmin(rigid)} (counted from 0) is not a rigid motion; "
                          "its left 3x3 block must be a rotation")
     return T
+
+
+def is_rigid(T):
+    """Whether matrices T (...,3,4) or (...,4,4) are finite and hold a rotation -> (...) bool."""
+    R = T[..., :3, :3]
+    with np.errstate(all="ignore"):  # huge numbers overflow
+        deviation = np.abs(R @ R.swapaxes(-1, -2) - np.eye(3)).max((-1, -2))
+        is_rotation = (deviation < 1e-2) & (np.linalg.det(R) > 0)
+    return np.isfinite(T).all((-1, -2)) & is_rotation
 
 
 def write_poses(path: str | Path, T: np.ndarray) -> None:
