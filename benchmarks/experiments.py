@@ -277,13 +277,15 @@ def config_of(changes, pairs, budget):
 
 
 def fingerprint(sequence):
-    """A hash that identifies the data of a sequence. Of the scans, which are large, only sizes and
-    modification times are hashed.
+    """A hash that identifies the data of a sequence, the same on every machine.
+
+    Of the scans, which are large, only sizes and first points are hashed.
     """
-    stats = [path.stat() for path in sequence.scan_paths]
-    scans = np.array([(s.st_size, s.st_mtime_ns) for s in stats])
-    content = scans.tobytes() + sequence.Tr.tobytes() + sequence.poses_cam.tobytes()
-    return hashlib.sha256(content).hexdigest()
+    digest = hashlib.sha256(sequence.Tr.tobytes() + sequence.poses_cam.tobytes())
+    for path in sequence.scan_paths:
+        with open(path, "rb") as file:
+            digest.update(str(path.stat().st_size).encode() + file.read(4096))
+    return digest.hexdigest()
 
 
 def plan(experiments, pairs, budget, seeds, out, data):
