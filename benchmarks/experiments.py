@@ -279,7 +279,7 @@ def config_of(changes, pairs, budget):
 def fingerprint(sequence):
     """A hash that identifies the data of a sequence, the same on every machine.
 
-    Of the scans, which are large, only sizes and first points are hashed.
+    Of each scan, only the size and the first 256 points are hashed.
     """
     digest = hashlib.sha256(sequence.Tr.tobytes() + sequence.poses_cam.tobytes())
     for path in sequence.scan_paths:
