@@ -201,12 +201,13 @@ def curve(run):
     epochs = re.findall(r"^epoch (\d+)/\d+: loss ([\d.]+)(?:, test loss ([\d.]+))?", log, re.M)
     if not epochs:
         raise ValueError(f"{run}/log.txt: holds no epoch")
+    epochs = {row[0]: row for row in epochs}.values()  # a resumed run may log an epoch again
     epoch, training, test = np.array([[x or "nan" for x in row] for row in epochs], float).T
     figure = metrics.new_figure(6, 3.3)
     axis = figure.subplots()
-    axis.plot(epoch, training, "o-", color="tab:orange", label="training, augmented")
+    axis.plot(epoch, training, ".-", color="tab:orange", label="training, augmented")
     if not np.isnan(test).all():
-        axis.plot(epoch, test, "o-", color="tab:blue", label="test sequences")
+        axis.plot(epoch, test, ".-", color="tab:blue", label="test sequences")
     axis.set(xlabel="epoch", ylabel="mean loss, eq. 2 [m and deg]", ylim=(0, None))
     axis.legend(frameon=False)
     axis.grid(color="0.9")
