@@ -885,10 +885,10 @@ class Odometry:
             pair = np.stack([last_records[0], records[0]])
             T_pq, = predict_motions(self.net, pair, self.device)
             pose = last_pose @ T_pq  # eq. 1
-        # Refine the pose against a keyframe, an earlier scan that is replaced every few metres, and
-        # the last scan. Errors then add up from keyframe to keyframe, not from scan to scan.
+        # Refine the pose: once with a keyframe, an earlier scan that is replaced every few metres,
+        # then with the last scan. Errors add up from keyframe to keyframe, not from scan to scan.
         if self.refine and self.keyframe:
-            references = [self.keyframe, self.last]
+            references = [self.keyframe] + [self.last] * (self.refine - 1)
             pose = refine_pose(self.net, references, records, pose, self.device)
         if self.refine and (not self.keyframe or is_far(invert(self.keyframe[1]) @ pose)):
             self.keyframe = records, pose
@@ -1208,16 +1208,15 @@ def mean_transform(transforms):
 def refine_pose(net, references, samplings, pose, device):
     """Refine the pose T_0q (4,4) of a scan Q with n samplings, records (n,). Returns T_0q.
 
-    references: a list of (records (n,), pose T_0p) of earlier scans P. Each pass uses one sampling
-    and the next reference in turn. It aligns Q with P using the current estimate, predicts the
-    residual motion in both directions, and updates the estimate. The result is the mean of all n
-    estimates, because most of their error depends on which points were sampled. Not in the paper.
+    references: n times (records (n,), pose T_0p) of an earlier scan P. Pass k uses sampling k of
+    both scans. It aligns Q with P using the current estimate, predicts the residual motion in both
+    directions, and updates the estimate. The result is the mean of all n estimates, because most
+    of their error depends on which points were sampled. Not in the paper.
     """
     estimates = []
-    for k, q in enumerate(samplings):
-        samplings_p, T_0p = references[k % len(references)]
+    for k, (samplings_p, T_0p) in enumerate(references):
         T = invert(T_0p) @ pose  # the current estimate of T_pq
-        aligned, = move_scans(q[None], T[None])
+        aligned, = move_scans(samplings[k][None], T[None])
         pair = np.stack([samplings_p[k], aligned])
         T_pq, T_qp = predict(net, pair, np.array([0, 1]), np.array([1, 0]), device)
         pose = T_0p @ mean_transform([T_pq, invert(T_qp)]) @ T
@@ -1812,7 +1811,8 @@ def eval_options(command):
         "weights, or the folder of a training run (default: the pretrained weights)"))
     add("--refine", type=int, metavar="N", help=(
         "not in the paper: refine each pose in N passes, each with its own sampling of the scan, "
-        "against a keyframe and the last scan in turn; 3 is recommended (default: 0)"))
+        "the first against a keyframe, the others against the last scan; 3 is recommended "
+        "(default: 0)"))
     add("--device", help="cpu, cuda or mps (default: cpu)")
     add = command.add_argument_group("results").add_argument
     add("--out", metavar="DIR", help=(

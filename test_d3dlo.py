@@ -1706,14 +1706,14 @@ def test_refining_averages_directions_samplings_and_references(seed, n):
         return T
 
     rng = generator(seed)
-    *earlier, q = (d3dlo.several_samplings(random_scan(rng, 48), SMALL, n) for _ in range(3))
-    poses, pose = random_motion(rng, n=2), random_motion(rng)
+    *earlier, q = (d3dlo.several_samplings(random_scan(rng, 48), SMALL, n) for _ in range(n + 1))
+    poses, pose = random_motion(rng, n=n), random_motion(rng)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(d3dlo, "predict", predict_one_way)
         got = d3dlo.refine_pose(None, list(zip(earlier, poses)), q, pose, "cpu")
     estimates = []
     for k in range(n):
-        p_k, T_0p = earlier[k % 2][k], poses[k % 2]
+        p_k, T_0p = earlier[k][k], poses[k]
         T = np.linalg.inv(T_0p) @ pose
         aligned, = d3dlo.move_scans(q[k][None], T[None])  # tested with the augmentation
         pose = T_0p @ mean([one_way(p_k, aligned), invert(one_way(aligned, p_k))]) @ T
@@ -1755,7 +1755,7 @@ def test_refined_odometry_registers_against_keyframes(tmp_path, seed):
             records["broken"] = i
             assert_allclose(odometry.register_records(records), truth[i], atol=1e-6)
             if i:
-                expected.append((keyframe, i - 1, i, 3))
+                expected.append((keyframe, i - 1, i - 1, i, 3))
                 T = invert(truth[keyframe]) @ truth[i]
                 angle = np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))
                 if np.linalg.norm(T[:3, 3]) >= 5 or angle >= 20:
