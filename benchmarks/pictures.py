@@ -191,7 +191,8 @@ def steps(plain, refined, classical):
             for i, noise in enumerate(TRUTH_NOISE.values()):
                 axis.plot([i - 0.42, i + 0.42], [100 * noise] * 2, "k--", lw=1,
                           label="noise of the ground truth" if i == 0 else None)
-            axis.legend(frameon=False, fontsize=8)
+            axis.set_ylim(0, 1.4 * axis.get_ylim()[1])  # room for the legend
+            axis.legend(frameon=False, fontsize=8, ncols=2)
     return figure
 
 
