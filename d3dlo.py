@@ -886,7 +886,7 @@ class Odometry:
             T_pq, = predict_motions(self.net, pair, self.device)
             pose = last_pose @ T_pq  # eq. 1
         # Refine the pose: once with a keyframe, an earlier scan that is replaced every few metres,
-        # then with the last scan. Errors add up from keyframe to keyframe, not from scan to scan.
+        # then with the last scan. The keyframe limits how fast errors add up from scan to scan.
         if self.refine and self.keyframe:
             references = [self.keyframe] + [self.last] * (self.refine - 1)
             pose = refine_pose(self.net, references, records, pose, self.device)

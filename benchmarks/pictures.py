@@ -183,8 +183,8 @@ def steps(plain, refined, classical):
             heights *= 100 if unit == "cm" else 1
             axis.bar(np.arange(2) + 0.27 * (i - 1), heights, 0.25, color=COLOURS[label],
                      label=label)
-        axis.set(xticks=range(2), xticklabels=[f"real {name}" for name in TRUTH_NOISE],
-                 ylabel=f"mean error per step [{unit}]")
+        labels = [name.replace("drive", "real drive ") for name in TRUTH_NOISE]
+        axis.set(xticks=range(2), xticklabels=labels, ylabel=f"mean error per step [{unit}]")
         axis.grid(axis="y", color="0.9")
         axis.set_axisbelow(True)
         if unit == "cm":
