@@ -1208,10 +1208,10 @@ def mean_transform(transforms):
 def refine_pose(net, references, samplings, pose, device):
     """Refine the pose T_0q (4,4) of a scan Q with n samplings, records (n,). Returns T_0q.
 
-    references: n times (records (n,), pose T_0p) of an earlier scan P. Pass k uses sampling k of
-    both scans. It aligns Q with P using the current estimate, predicts the residual motion in both
-    directions, and updates the estimate. The result is the mean of all n estimates, because most
-    of their error depends on which points were sampled. Not in the paper.
+    references: a list of n pairs (records (n,), pose T_0p), an earlier scan P for each pass.
+    Pass k uses sampling k of both scans. It aligns Q with P using the current estimate, predicts
+    the residual motion in both directions, and updates the estimate. The result is the mean of all
+    n estimates, because most of their error depends on which points were sampled. Not in the paper.
     """
     estimates = []
     for k, (samplings_p, T_0p) in enumerate(references):

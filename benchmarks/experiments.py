@@ -305,10 +305,11 @@ def plan(experiments, pairs, budget, seeds, out, data):
 def seconds_a_step(config):
     """Estimate the seconds that one core needs for a pair-step.
 
-    Measured on a core of a 2.3 GHz Xeon: 15 ms with the 8 neighbours of Table 1, and 3.4 times as
-    long with 128. Another network may take longer: with two scales it takes 1.7 times as long.
+    Measured with two runs at a time on the two cores of a Xeon: 26 ms with the 8 neighbours of
+    Table 1 and 35 ms with 32. On another machine, 128 took 3.4 times as long as 8. Another network
+    may take longer: with two scales it takes 1.7 times as long.
     """
-    return 0.015 * (0.85 + 0.15 * config.sa1.n_n / 8)
+    return 0.026 * (0.85 + 0.15 * config.sa1.n_n / 8)
 
 
 # ------------------------------------------------------------------------------------------------
