@@ -34,6 +34,7 @@ import torch.nn.functional as F
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy import stats
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
@@ -2918,6 +2919,30 @@ def test_table_2_has_every_combination_of_neighbours_and_plane():
     rows = [Config(**variant.changes) for variant in experiments.EXPERIMENTS["table2"].values()]
     combinations = {(config.sa1.n_n, config.plane) for config in rows}
     assert combinations == {(n, plane) for n in (8, 16, 32, 64, 128) for plane in (True, False)}
+
+
+def test_effects_are_differences_of_means_and_slopes_of_regressions(tmp_path):
+    rng = generator(0)
+    rows = experiments.plan(["table2"], 100, 1500, [0, 1], tmp_path, "data")["table2"]
+    runs = [run for of_seeds in rows.values() for run in of_seeds]
+    plane = np.array([run.config.plane for run in runs], float)
+    doublings = np.log2([run.config.sa1.n_n for run in runs])
+    y = 8 - 0.3 * plane + 0.2 * doublings + 0.1 * rng.standard_normal(len(runs))
+    for run, E_t in zip(runs, y):
+        metrics.write_json(run.folder / "all" / "results.json", dict(
+            pooled=dict(zip(experiments.DIGITS, (E_t, 0, 1, 2))),
+            splits=dict(test=dict(zip(experiments.DIGITS, (-E_t, 0, 1, 2))))))
+
+    (b, c), half_widths = (values[:, 0] for values in experiments.effects(rows, "all"))
+    assert np.isclose(b, y[plane == 1].mean() - y[plane == 0].mean())
+    assert np.isclose(c, stats.linregress(doublings, y).slope)
+    others = y - c * doublings, y - b * plane  # without the other effect
+    for half_width, x, rest in zip(half_widths, (plane, doublings), others):
+        # linregress counts one degree of freedom more
+        error = stats.linregress(x, rest).stderr * np.sqrt((len(runs) - 2) / (len(runs) - 3))
+        assert np.isclose(half_width, stats.t.ppf(0.975, len(runs) - 3) * error)
+    assert np.isclose(experiments.effects(rows, "test")[0][:, 0], (-b, -c)).all()
+    assert f"| {b:+.3f} ± {half_widths[0]:.3f} |" in experiments.effects_in_markdown(rows)
 
 
 def test_experiments_share_runs_but_not_across_data_or_budgets(tmp_path):

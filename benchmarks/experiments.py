@@ -31,6 +31,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
+from scipy import stats
 from scipy.spatial.transform import Rotation
 from torch import nn
 
@@ -464,6 +465,11 @@ def cell(values, digits):
     return mean if len(values) == 1 else f"{mean} ({low} to {high})"
 
 
+def join_cells(lines):
+    """Lists of cells -> a table in Markdown."""
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
 def markdown(experiment, runs, measured, words):
     """The table of an experiment in Markdown, followed by `words`.
 
@@ -481,8 +487,35 @@ def markdown(experiment, runs, measured, words):
                 paper = [f"{E_t}", f"{E_r:.5f}"]
             ours = [cell(values[key], digits) for key, digits in DIGITS.items()]
             lines.append([name, split, parameters, *paper, *ours])
-    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-    return f"# {experiment}\n\n{table}\n\n{words}\n"
+    return f"# {experiment}\n\n{join_cells(lines)}\n\n{words}\n"
+
+
+def effects(rows, split):
+    """The effects of the plane and of n_n on each figure, estimated from all Runs of Table 2.
+
+    Least squares: figure = a + b [1 with the plane, 0 without] + c log2(n_n). Returns b and c, and
+    half the widths of their 95 % confidence intervals (Student's t): (2,4), (2,4).
+    """
+    runs = [run for of_seeds in rows.values() for run in of_seeds]
+    factors = [[1, run.config.plane, np.log2(run.config.sa1.n_n)] for run in runs]
+    X = np.array(factors, float)  # (n,3)
+    Y = np.array([list(figures(run, split).values()) for run in runs])  # (n,4)
+    coefficients, squares, *_ = np.linalg.lstsq(X, Y, rcond=None)  # (3,4), (4,)
+    freedom = len(X) - 3
+    variances = np.linalg.inv(X.T @ X).diagonal()[:, None] * squares / freedom  # (3,4)
+    half_widths = stats.t.ppf(0.975, freedom) * np.sqrt(variances)
+    return coefficients[1:], half_widths[1:]
+
+
+def effects_in_markdown(rows):
+    """The table of `effects` on the test split and on all sequences."""
+    lines = [["effect, with its 95 % confidence interval", "split", *HEADER[-4:]], ["---"] * 6]
+    for split in ("test", "all"):
+        for name, *row in zip(("the plane", "twice the neighbours"), *effects(rows, split)):
+            cells = [f"{value:+.{digits}f} ± {half_width:.{digits}f}"
+                     for value, half_width, digits in zip(*row, DIGITS.values())]
+            lines.append([name, split, *cells])
+    return join_cells(lines)
 
 
 def write_table(experiment, runs, out, words):
@@ -594,6 +627,8 @@ def main():
     run_all(todo, root, trained, evaluated, configs, args.jobs)
     for experiment, rows in runs.items():
         words = caption(experiment, args, trained, pairs, steps)
+        if experiment == "table2":
+            words += f"\n\n{effects_in_markdown(rows)}"
         write_table(experiment, rows, args.out, words)
 
 
