@@ -2931,7 +2931,7 @@ def test_effects_are_differences_of_means_and_slopes_of_regressions(tmp_path):
     for run, E_t in zip(runs, y):
         metrics.write_json(run.folder / "all" / "results.json", dict(
             pooled=dict(zip(experiments.DIGITS, (E_t, 0, 1, 2))),
-            splits=dict(test=dict(zip(experiments.DIGITS, (-E_t, 0, 1, 2))))))
+            splits=dict(test=dict(zip(experiments.DIGITS, (-E_t, math.nan, 1, 2))))))
 
     (b, c), half_widths = (values[:, 0] for values in experiments.effects(rows, "all"))
     assert np.isclose(b, y[plane == 1].mean() - y[plane == 0].mean())
@@ -2942,7 +2942,8 @@ def test_effects_are_differences_of_means_and_slopes_of_regressions(tmp_path):
         error = stats.linregress(x, rest).stderr * np.sqrt((len(runs) - 2) / (len(runs) - 3))
         assert np.isclose(half_width, stats.t.ppf(0.975, len(runs) - 3) * error)
     assert np.isclose(experiments.effects(rows, "test")[0][:, 0], (-b, -c)).all()
-    assert f"| {b:+.3f} ± {half_widths[0]:.3f} |" in experiments.effects_in_markdown(rows)
+    table = experiments.effects_in_markdown(rows)
+    assert f"| the plane | test | {-b:+.3f} ± {half_widths[0]:.3f} | - |" in table
 
 
 def test_experiments_share_runs_but_not_across_data_or_budgets(tmp_path):

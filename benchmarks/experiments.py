@@ -439,10 +439,10 @@ DIGITS = {"E_t": 3, "E_r": 5, "t_step_m": 4, "r_step_deg": 4}  # after the decim
 
 
 def figures(run, split):
-    """E_t, E_r, t step and r step of a Run on a split, a dict. NaN where there is no segment."""
+    """E_t, E_r, t step and r step of a Run on a split, a dict. NaN without a segment or split."""
     results = json.loads((run.folder / "all" / "results.json").read_text(encoding="utf-8"))
-    result = results["pooled"] if split == "all" else results["splits"][split]
-    return {key: math.nan if result[key] is None else result[key] for key in DIGITS}
+    result = results["pooled"] if split == "all" else results["splits"].get(split, {})
+    return {key: math.nan if result.get(key) is None else result[key] for key in DIGITS}
 
 
 def figures_of_seeds(experiment, runs):
@@ -500,8 +500,8 @@ def effects(rows, split):
     factors = [[1, run.config.plane, np.log2(run.config.sa1.n_n)] for run in runs]
     X = np.array(factors, float)  # (n,3)
     Y = np.array([list(figures(run, split).values()) for run in runs])  # (n,4)
-    coefficients, squares, *_ = np.linalg.lstsq(X, Y, rcond=None)  # (3,4), (4,)
-    freedom = len(X) - 3
+    coefficients = np.linalg.pinv(X) @ Y  # (3,4)
+    squares, freedom = ((Y - X @ coefficients) ** 2).sum(0), len(X) - 3
     variances = np.linalg.inv(X.T @ X).diagonal()[:, None] * squares / freedom  # (3,4)
     half_widths = stats.t.ppf(0.975, freedom) * np.sqrt(variances)
     return coefficients[1:], half_widths[1:]
@@ -512,7 +512,7 @@ def effects_in_markdown(rows):
     lines = [["effect, with its 95 % confidence interval", "split", *HEADER[-4:]], ["---"] * 6]
     for split in ("test", "all"):
         for name, *row in zip(("the plane", "twice the neighbours"), *effects(rows, split)):
-            cells = [f"{value:+.{digits}f} ± {half_width:.{digits}f}"
+            cells = ["-" if np.isnan(value) else f"{value:+.{digits}f} ± {half_width:.{digits}f}"
                      for value, half_width, digits in zip(*row, DIGITS.values())]
             lines.append([name, split, *cells])
     return join_cells(lines)
