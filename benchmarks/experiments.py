@@ -307,10 +307,10 @@ def seconds_a_step(config):
     """Estimate the seconds that one core needs for a pair-step.
 
     Measured with two runs at a time on the two cores of a Xeon: 26 ms with the 8 neighbours of
-    Table 1, 38 ms with 32 and 49 ms with 64. On another machine, 128 took 3.4 times as long as 8.
-    Another network may take longer: with two scales it takes 1.7 times as long.
+    Table 1, 38 ms with 32, 49 ms with 64 and 74 ms with 128. Another network may take longer: with
+    two scales it takes 1.7 times as long.
     """
-    return 0.026 * (0.85 + 0.15 * config.sa1.n_n / 8)
+    return 0.023 + 0.0004 * config.sa1.n_n
 
 
 # ------------------------------------------------------------------------------------------------
