@@ -216,25 +216,29 @@ def curve(run):
 
 
 def table2(out):
-    """Draw Table 2, E_t by the number of neighbours: the paper's, and ours from OUT/table2.json."""
+    """Draw the errors of Table 2 by the number of neighbours: the paper's E_t, and our E_t and
+    translation per step from OUT/table2.json.
+    """
     rows = json.loads((out / "table2.json").read_text(encoding="utf-8"))
     n_n = sorted({neighbours for neighbours, _ in PAPER_2})
-    figure = metrics.new_figure(8, 3.2)
-    paper, ours = figure.subplots(1, 2)
+    figure = metrics.new_figure(11, 3.2)
+    paper, ours, steps = figure.subplots(1, 3)
     for plane, colour in ((True, "tab:blue"), (False, "tab:orange")):
         label = "with the plane" if plane else "without the plane"
         paper.plot(n_n, [PAPER_2[n, plane][0] for n in n_n], "o-", color=colour, label=label)
-        E_t = np.array([rows[row_of_table_2(n, plane, None)[0]]["all"]["E_t"] for n in n_n])
-        ours.plot(n_n, E_t.mean(1), "-", color=colour, label=label)  # E_t (5,seeds)
-        ours.plot(n_n, E_t, "o", color=colour, markersize=4)
-    paper.set(title="the paper, on KITTI")
-    ours.set(title="here, in simulation (dots: seeds)")
-    for axis in (paper, ours):
+        for axis, key in ((ours, "E_t"), (steps, "t_step_m")):
+            each = [rows[row_of_table_2(n, plane, None)[0]]["all"][key] for n in n_n]  # (5,seeds)
+            axis.plot(n_n, np.mean(each, 1), "-", color=colour)
+            axis.plot(n_n, each, "o", color=colour, markersize=4)
+    paper.set(title="the paper, on KITTI", ylabel="E_t [%]")
+    ours.set(title="here, in simulation (dots: seeds)", ylabel="E_t [%]")
+    steps.set(title="here, in simulation (dots: seeds)", ylabel="t step [m]")
+    for axis in (paper, ours, steps):
         axis.set_xscale("log", base=2)
         axis.set(xticks=n_n, xticklabels=n_n, xlabel="neighbours n_n in SA1",
-                 ylabel="E_t, all sequences [%]", ylim=(0, None))
+                 ylim=(0, 1.1 * axis.get_ylim()[1]))
         axis.grid(color="0.9")
-    paper.legend(frameon=False)
+    paper.legend(frameon=False, loc="lower left")
     return figure
 
 
