@@ -13,7 +13,7 @@ Read this file beside the paper, from top to bottom:
     8  Our additions            not in the paper: augmentation and refinement
     9  Faster versions of functions in parts 2 and 3. The code calls these, and they return the
        same results up to rounding. To understand the method, read parts 2 and 3.
-    10 The command line
+    10 The commands train and eval
 
 kitti.py converts motions to the vectors of section 3.2 (`to_vector`), removes the ground plane
 (section 4), and loads or simulates the data. metrics.py computes E_t and E_r, eqs. 6 to 8. What
@@ -71,7 +71,7 @@ class Layer(NamedTuple):
     r: float | None  # radius of the ball [m]
     n_fps: int | None  # number of centroids kept by farthest point sampling
     n_n: int | None  # number of neighbours (the maximum, for a ball)
-    mlp: tuple  # output width of every linear layer
+    widths: tuple  # MLP: output width of every linear layer
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Config:
 
     # Training, section 4
     epochs: int = 500
-    batch: int = 16  # pairs of scans in a batch; the paper does not say
+    batch: int = 16  # pairs of scans in a batch, at least; the paper does not say
     optimizer: str = "adam"  # the paper's; or ours, "muon": Muon for the hidden layers
     lr: float = 1e-3  # learning rate: Adam's default; with "one-cycle" the peak
     schedule: str = "steps"  # lr / 10 (factor ours) after 3/5 and 4/5 of the steps; or "one-cycle"
@@ -101,9 +101,10 @@ class Config:
     frozen: float = 0.0  # ours: share of the steps, at the end, with fixed BatchNorm statistics
 
     def __post_init__(self):
-        for name in ("sa1", "fe", "sa2", "sa3", "mpn", "mlp"):  # from JSON, tuples are lists
-            *numbers, mlp = getattr(self, name)
-            object.__setattr__(self, name, Layer(*numbers, tuple(mlp)))
+        # JSON turns a Layer into a list. Turn it back; a frozen dataclass needs object.__setattr__.
+        for name in ("sa1", "fe", "sa2", "sa3", "mpn", "mlp"):
+            *numbers, widths = getattr(self, name)
+            object.__setattr__(self, name, Layer(*numbers, tuple(widths)))
         check_config(self)
 
     def as_dict(self):
@@ -123,14 +124,14 @@ def check_config(config):
     def positive(x):
         return type(x) in (int, float) and 0 < x < math.inf
 
-    sa1, fe, sa2, sa3, mlp = config.sa1, config.fe, config.sa2, config.sa3, config.mlp.mlp
-    widths = [sa1.mlp, fe.mlp, sa2.mlp, sa3.mlp, config.mpn.mlp, mlp]
+    sa1, fe, sa2, sa3, mlp = config.sa1, config.fe, config.sa2, config.sa3, config.mlp
+    widths = [layer.widths for layer in (sa1, fe, sa2, sa3, config.mpn, mlp)]
     require(all(positive(sa.r) for sa in (sa1, sa2, sa3)), "every radius must be positive")
     require(all(whole(sa.n_fps, 65535) for sa in (sa1, sa2, sa3)), "n_fps must be 1 to 65,535")
     require(sa1.n_fps >= sa2.n_fps >= sa3.n_fps, "n_fps must not increase from layer to layer")
     require(all(whole(x.n_n, 1024) for x in (sa1, fe, sa2, sa3)), "n_n must be 1 to 1,024")
     require(all(len(w) > 1 and all(map(whole, w)) for w in widths), "an MLP needs 2 layers or more")
-    require(mlp[-1] == 6, "the last width of mlp must be 6: translation and angles")
+    require(mlp.widths[-1] == 6, "the last width of mlp must be 6: translation and angles")
     require(config.max_range is None or positive(config.max_range), "max_range must be positive")
     require(whole(config.epochs) and whole(config.batch), "epochs and batch must be 1 or more")
     require(positive(config.lr), "lr must be positive")
@@ -161,7 +162,7 @@ def fps_textbook(xyz, n, start=0):
     """
     x, y, z = np.ascontiguousarray(xyz.T)
     min_dist = np.full(len(xyz), np.inf, xyz.dtype)  # squared distance to the nearest centroid
-    centroids = np.full(n, start)
+    centroids = np.full(n, start)  # all but the first are replaced
     for i in range(1, n):
         j = centroids[i - 1]
         dist = (x - x[j]) ** 2 + (y - y[j]) ** 2 + (z - z[j]) ** 2  # (N,)
@@ -173,10 +174,11 @@ def fps_textbook(xyz, n, start=0):
 def group_ball(xyz: np.ndarray, centroids: np.ndarray, r: float, n_n: int, tree=None) -> np.ndarray:
     """The neighbours i of each centroid j in eq. 3: the nearest n_n points with |x_i - x'_j| <= r.
 
-    xyz (N,3) in metres, centroids (S,) indices into xyz -> (S,n_n) indices, nearest first. The
-    first one is the centroid itself, or a point at the same place, so no ball is empty. Missing
-    neighbours are filled with the centroid. These copies leave the maximum in eq. 3 unchanged but
-    do affect the statistics of batch normalisation. tree: a cKDTree of xyz. None builds one.
+    xyz (N,3) in metres, centroids (S,) indices into xyz -> (S,n_n) indices, nearest first (the
+    paper does not say which n_n points it takes). The first one is the centroid itself, or a point
+    at the same place, so no ball is empty. Missing neighbours are filled with the centroid. These
+    copies leave the maximum in eq. 3 unchanged but do affect the statistics of batch normalisation.
+    tree: a cKDTree of xyz. None builds one.
     """
     ranks = [*range(1, n_n + 1)]  # a list keeps the result two-dimensional for n_n = 1
     inclusive = np.nextafter(r, np.inf)  # scipy's bound is exclusive
@@ -236,8 +238,9 @@ def usable_scan(scan, config):
 def group_scan(scan, broken, centroids, tree, config):
     """Usable points (N,4), indices of SA1's centroids (n1,), cKDTree of the points -> record.
 
-    One sampling serves all layers: SA1's centroids are in sampling order, so SA2's centroids are
-    the first n2 of them, and SA3's the first n3.
+    One sampling serves all layers. Farthest point sampling of SA1's centroids, from the first one,
+    would choose them in the same order again. So SA2's centroids are the first n2 of them, and
+    SA3's the first n3.
     """
     sa1, sa2, sa3 = config.sa1, config.sa2, config.sa3
     cloud = np.ascontiguousarray(scan[:, :3])
@@ -295,7 +298,7 @@ def neighbours_in_q(xyz, p, q, k):
 
 
 def mlp_layers(c, widths):
-    """h of eqs. 3 and 4: for each width a linear layer, batch normalisation and ReLU."""
+    """An MLP such as h in eqs. 3 and 4. For each width: linear, batch normalisation, ReLU."""
     layers = []
     for c_in, c_out in itertools.pairwise((c, *widths)):
         layers += [nn.Linear(c_in, c_out), nn.BatchNorm1d(c_out), nn.ReLU()]
@@ -309,7 +312,7 @@ def gather(x, idx):
 
 
 class MiniPointNet(nn.Module):
-    """Section 3.3.1: the same MLP h for every point, then the maximum over all points."""
+    """Section 3.3.1: the same MLP h for every point, then the maximum over the points."""
 
     def __init__(self, c, widths):
         super().__init__()
@@ -326,7 +329,7 @@ class SetAbstraction(nn.Module):
 
     def __init__(self, c, layer):
         super().__init__()
-        self.mpn = MiniPointNet(c + 3, layer.mlp)
+        self.mpn = MiniPointNet(c + 3, layer.widths)
 
     def forward(self, x, f, idx):
         """x (B,n,3), f (B,n,c), idx (B,S,k) -> f' (B,S,c'); centroids are the first S points."""
@@ -340,7 +343,7 @@ class FlowEmbedding(nn.Module):
 
     def __init__(self, c, layer):
         super().__init__()
-        self.mpn = MiniPointNet(2 * c + 3, layer.mlp)
+        self.mpn = MiniPointNet(2 * c + 3, layer.widths)
 
     def forward(self, x, f, y, g, idx):
         """P: x (B,S,3), f (B,S,c); Q: y (B,n,3), g (B,n,c); idx (B,S,k) -> e (B,S,c')."""
@@ -361,18 +364,19 @@ class D3DLO(nn.Module):
         super().__init__()
         self.config = config
         self.sa1 = SetAbstraction(1, config.sa1)  # c = 1, the intensity
-        self.fe = FlowEmbedding(config.sa1.mlp[-1], config.fe)
-        self.sa2 = SetAbstraction(config.fe.mlp[-1], config.sa2)
-        self.sa3 = SetAbstraction(config.sa2.mlp[-1], config.sa3)
-        self.mpn = MiniPointNet(config.sa3.mlp[-1], config.mpn.mlp)
-        *hidden, out = config.mlp.mlp  # 64, 6
-        self.mlp = mlp_layers(config.mpn.mlp[-1], hidden)
+        self.fe = FlowEmbedding(config.sa1.widths[-1], config.fe)
+        self.sa2 = SetAbstraction(config.fe.widths[-1], config.sa2)
+        self.sa3 = SetAbstraction(config.sa2.widths[-1], config.sa3)
+        self.mpn = MiniPointNet(config.sa3.widths[-1], config.mpn.widths)
+        *hidden, out = config.mlp.widths  # 64, 6
+        self.mlp = mlp_layers(config.mpn.widths[-1], hidden)
         self.mlp.append(nn.Linear(hidden[-1], out))
 
     def forward(self, batch: Batch) -> torch.Tensor:
         """Batch -> y_hat (B,6): [tx, ty, tz] in metres, [roll, pitch, yaw] in degrees, of T_pq."""
         p, q = batch.p, batch.q
-        # SA1 for every scan, eq. 3. group_scan has gathered its inputs [f_i, x_i - x'_j].
+        # SA1 for every scan, eq. 3. Its inputs [f_i, x_i - x'_j] were gathered in `group_scan`,
+        # since a record holds only the neighbours and not the whole scan.
         features = self.sa1.mpn(batch.group_sa1)  # (C,1024,32)
         # FE for every pair, eq. 4. (index_select has a faster backward pass than [p].)
         x, f = batch.xyz[p], features.index_select(0, p)  # (B,1024,3), (B,1024,32) of P
@@ -402,16 +406,19 @@ class UnweightedLoss(nn.Module):
 
 
 def training_batch(geometry, motions, pairs, config, rng, device="cpu"):
-    """`pairs` (n,2), each a sequence index s and a scan index i -> Batch and its T_pq (B,4,4).
+    """Load n pairs of scans for training -> Batch, and the motions T_pq (B,4,4) to predict.
 
-    P is scan i and Q scan i + 1. With augmentation, some pairs imitate refinement: Q may be several
-    scans later, and is aligned with P up to a small motion.
+    pairs: (n,2), the index s of the sequence and i of the scan P; Q is scan i + 1. With
+    augmentation, some pairs imitate refinement: Q may be several scans later, and is aligned with P
+    up to a small motion. Each pair is used in one random direction (B = n) or in both (B = 2n).
     """
     n = len(pairs)
-    aligned = rng.random(n) < ALIGNED if config.augment else np.zeros(n, bool)
+    aligned = np.zeros(n, bool)
+    if config.augment:
+        aligned = rng.random(n) < ALIGNED
     scans_p, scans_q, T_pq = [], [], []
-    for (s, i), several_apart in zip(pairs, aligned):
-        j = later_scan(motions[s], i, rng) if several_apart else i + 1
+    for (s, i), is_aligned in zip(pairs, aligned):
+        j = later_scan(motions[s], i, rng) if is_aligned else i + 1
         scans_p.append(geometry[s][i])
         scans_q.append(geometry[s][j])
         T_pq.append(functools.reduce(np.matmul, motions[s][i:j]))  # T_{i,i+1} ... T_{j-1,j}
@@ -426,6 +433,11 @@ def training_batch(geometry, motions, pairs, config, rng, device="cpu"):
         p, q = np.where(swapped, q, p), np.where(swapped, p, q)
         T = np.where(swapped[:, None, None], T_qp, T_pq)
     return make_batch(scans, p, q, config, device), T
+
+
+def all_pairs(motions):
+    """All pairs of consecutive scans (pairs,2): the index of the sequence and of the first scan."""
+    return np.array([(s, i) for s, T in enumerate(motions) for i in range(len(T))])
 
 
 def steps_per_epoch(motions, config):
@@ -448,8 +460,7 @@ def batches(geometry, motions, config, seed, start, stop, device="cpu"):
     A batch depends only on `seed` (a tuple) and its number, so an interrupted training run
     continues with the batches it would have seen.
     """
-    pairs = np.array([(s, i) for s, T in enumerate(motions) for i in range(len(T))])
-    per_epoch = steps_per_epoch(motions, config)
+    pairs, per_epoch = all_pairs(motions), steps_per_epoch(motions, config)
 
     def prepare(step):
         epoch, part = divmod(step, per_epoch)
@@ -593,7 +604,7 @@ class Training:
 
     @contextmanager
     def checkpoint_on_error(self):
-        """Store a checkpoint if an exception is raised in the block between two steps.
+        """Store a checkpoint if an exception is raised while no step is in progress.
 
         A FloatingPointError stores nothing and becomes a ValueError.
         """
@@ -612,7 +623,7 @@ class Training:
 
 
 def targets(net, batch, T):
-    """Poses T (B,4,4) as regression targets y (B,6), on the device of the batch."""
+    """Motions T (B,4,4) as regression targets y (B,6), on the device of the batch."""
     return to_device(net.encode(T).astype(np.float32), batch.xyz.device)
 
 
@@ -634,13 +645,12 @@ def mean_loss(net, objective, examples):
 
 
 def test_examples(geometry, motions, config, device):
-    """Yield (Batch, T) of 500 pairs spread evenly over sequences, or of all if there are fewer."""
-    pairs = [(s, i) for s, T in enumerate(motions) for i in range(len(T))]
+    """Yield (Batch, T) of 500 evenly spaced pairs in both directions, or of all if there are fewer."""
+    pairs = all_pairs(motions)
     chosen = np.unique(np.linspace(0, len(pairs) - 1, 500).astype(int))
     as_they_are = replace(config, swap="both", augment=False)
     for part in np.array_split(chosen, math.ceil(len(chosen) / 16)):
-        some = [pairs[i] for i in part]
-        yield training_batch(geometry, motions, some, as_they_are, None, device)
+        yield training_batch(geometry, motions, pairs[part], as_they_are, None, device)
 
 
 def fit(net, geometry, motions, run, seed=0, device="cpu", checkpoint=None, say=print,
@@ -651,8 +661,8 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", checkpoint=None, say=
     seed: random seed for pair order and augmentation.
     checkpoint: the content of a checkpoint to continue from.
     say: called with each line to report.
-    test: geometry and motions of the test sequences. Their loss is reported after every epoch and
-        used for nothing else.
+    test: geometry and motions of the test sequences. Their loss is reported after every epoch. The
+        weights do not depend on it.
 
     Every STORE_EVERY seconds and at the end, RUN/checkpoint.pt and RUN/weights.pt are written.
     Ctrl-C lets the current step finish. Raises ValueError if the loss, a weight or a statistic is
@@ -688,6 +698,8 @@ def fit(net, geometry, motions, run, seed=0, device="cpu", checkpoint=None, say=
         loss = mean_loss(model, training.objective, training.bn_batches())
         training.store_checkpoint()
         training.store_weights(trained)
+    if interrupted:  # after the last step
+        raise KeyboardInterrupt(f"the weights are complete: {run}/weights.pt")
     say(f"training loss in eval mode: {loss:.4f}")
     return trained
 
@@ -787,14 +799,6 @@ def to_device(array, device):
     if torch.device(device).type == "cuda":
         tensor = tensor.pin_memory()
     return tensor.to(device, non_blocking=True)
-
-
-def knn_by_matrix(x, y, k):
-    """`group_knn` by a matrix of distances: x (B,S,3), y (B,n,3) -> (B,S,k) indices into y."""
-    distances = torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist")  # accurate
-    idx = distances.topk(min(k, y.shape[1]), largest=False).indices  # (B,S,k), nearest first
-    missing = k - idx.shape[2]  # repeat the nearest when there are fewer than k points
-    return torch.cat([idx, idx[..., :1].expand(-1, -1, missing)], 2) if missing else idx
 
 
 # ------------------------------------------------------------------------------------------------
@@ -927,7 +931,7 @@ def load_geometry(sequences, config, cache="cache"):
     compute = functools.partial(scan_geometry, config=config)
     dtype = geometry_dtype(config)
     depends = (GEOMETRY_VERSION, config.sa1.r, config.sa2.r, config.sa3.r, config.plane,
-               config.max_range)
+               config.max_range)  # and on n_fps and n_n, which determine dtype
     geometry, crcs = kitti.cached_records(sequences, compute, dtype, depends, cache)
     for s, records in zip(sequences, geometry):
         if (broken := records["broken"]).any():
@@ -994,33 +998,6 @@ def evaluate_sequences(odometry, sequences, out, source):
     return summarize(errors, {s.name: f in known for s, f in zip(sequences, fingerprints)})
 
 
-def evaluate_folder(odometry, s, out, source, say=print):
-    """Predict the trajectory of a `kitti.ScanFolder`, with poses in the LiDAR's frame.
-
-    Writes OUT/poses.txt, OUT/poses.tum and OUT/results.json. Returns the folder OUT.
-    source: see `claim_results`.
-    """
-    began = time.monotonic()
-    (records,), _ = load_geometry([s], odometry.net.config)
-    poses = predict_poses(odometry, s, records)
-    rate = len(s) / (time.monotonic() - began)
-    claim_results(out, source)
-    metrics.write_poses(out / "poses.txt", poses)
-    kitti.write_tum(out / "poses.tum", poses, s.times)
-    length = metrics.path_lengths(poses)[-1]
-    lines = [f"{s.folder}: {len(s)} scans, path of {length:.1f} m, {rate:.1f} scans a second",
-             *(f"note          {note}" for note in s.notes),
-             "frame         LiDAR at the first scan: x forward, y left, z up, in metres",
-             f"trajectory    {out}/poses.txt (12 numbers a line, as in KITTI's pose files)",
-             f"              {out}/poses.tum (t x y z qx qy qz qw, t in seconds)"]
-    if "plot.png" in source["files"]:
-        metrics.draw(out / "plot.png", {s.name: (None, poses)})
-        lines.append(f"plot          {out}/plot.png (from above)")
-    metrics.write_json(out / "results.json", source | {"path_m": length, "scans": len(s)})
-    say("\n".join(lines))
-    return out
-
-
 def summarize(errors, trained_on):
     """Average the errors per sequence, split and segment length, in the layout of results.json.
 
@@ -1051,102 +1028,6 @@ def results_table(results):
         rows += [metrics.row(f"  {predictor}", s[predictor]) for predictor in BASELINES]
     rows += [metrics.row(length, s) for length, s in results["lengths"].items()]
     return f"{metrics.table(metrics.HEADER, rows)}\n*: trained on. {LEGEND}"
-
-
-def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", refine=0, plot=False,
-             say=print, network=D3DLO):
-    """Run the command `eval`: write trajectories and results.json, and print a table of errors.
-
-    data: a folder in KITTI's layout, or a plain folder of scans, which gives a trajectory only.
-        None: the simulated city.
-    weights: a weights file or the folder of a training run. None: the pretrained weights.
-    sequences: a list of names or splits. None: all, or the simulated test and validation splits.
-    out: the folder to write to. None: a new one, results/TIME.
-    device: cpu, cuda or mps.
-    refine: number of refinement passes, see `refine_pose`.
-    plot: also draw OUT/plot.png.
-    say: called with the text to print.
-    network: the class of the network.
-
-    Returns the folder `out`. Raises ValueError if an argument, the weights or the data are
-    invalid, and OSError if a file cannot be read or written.
-    """
-    odometry = Odometry(weights, device, refine, network)
-    if plot:
-        metrics.new_figure(1, 1)  # without matplotlib, fail now and not after the work
-    sequences = sequences or ("all" if data else ("test", "validation"))
-    root = data_root(data, sequences)
-    out = kitti.unused_path("results") if out is None else Path(out)
-    check_output(out, root)
-    chosen = kitti.open_sequences(root, sequences)
-    is_folder = isinstance(chosen[0], kitti.ScanFolder)
-    files = ["poses.txt", "poses.tum"] if is_folder else [f"{s.name}.txt" for s in chosen]
-    for_server = {f"{i}.txt" for i in range(11, 22)} <= set(files)  # KITTI's without ground truth
-    if for_server:
-        files.append("kitti-server.zip")
-    if plot:
-        files.append("plot.png")
-    check_results(out, files)
-    source = {"weights": str(weights or PRETRAINED), "data": str(root), "refine": refine,
-              "files": files}
-    if is_folder:
-        return evaluate_folder(odometry, chosen[0], out, source, say)
-
-    results = evaluate_sequences(odometry, chosen, out, source)
-    lines = [f"trajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)",
-             f"errors        {out}/results.json"]
-    if for_server:
-        lines.append(f"to submit     {zip_for_server(out)}")
-    if plot:
-        T = {s.name: (s.poses_cam, metrics.read_poses(out / f"{s.name}.txt")) for s in chosen}
-        metrics.draw(out / "plot.png", T)
-        lines.append(f"plot          {out}/plot.png (from above, errors by length)")
-    metrics.write_json(out / "results.json", source | results)
-    say("\n".join([results_table(results), *lines]))
-    return out
-
-
-def earlier_results(out):
-    """The paths of the files in OUT that an earlier evaluation wrote, by OUT/results.json."""
-    try:
-        content = json.loads((out / "results.json").read_text(encoding="utf-8"))
-        if not {"data", "refine", "files"} <= content.keys():  # not ours
-            return []
-        names = [name for name in content["files"] if Path(name).name == name]
-    except (OSError, ValueError, TypeError, AttributeError):  # there is none, or it is not ours
-        return []
-    written = [name for name in names if Path(name).suffix in (".txt", ".tum", ".png", ".zip")]
-    return [out / name for name in (*written, "results.json") if (out / name).is_file()]
-
-
-def check_results(out, files):
-    """Raise ValueError if an evaluation that writes `files` to OUT would replace other files."""
-    earlier = earlier_results(out)
-    for path in [out / name for name in (*files, "results.json")]:
-        if path.exists() and path not in earlier:
-            raise ValueError(f"{path} exists and is not from an earlier evaluation there: move it, "
-                             "or choose another --out")
-
-
-def claim_results(out, source):
-    """Delete what an earlier evaluation wrote to OUT, and begin OUT/results.json with `source`.
-
-    source: weights, data, refine, and the list of files that will be written. So these files are
-    known to be ours even if the evaluation is interrupted.
-    """
-    for path in earlier_results(out):
-        path.unlink()
-    metrics.write_json(out / "results.json", source)
-
-
-def zip_for_server(out):
-    """Write OUT/kitti-server.zip, with 11.txt to 21.txt at its top level. Returns its path."""
-    path = out / "kitti-server.zip"
-    with metrics.replacing(path) as temporary:
-        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-            for i in range(11, 22):
-                archive.write(out / f"{i}.txt", f"{i}.txt")
-    return path
 
 
 # ------------------------------------------------------------------------------------------------
@@ -1253,7 +1134,7 @@ def is_far(T):
 # 9  Faster versions of functions in parts 2 and 3
 #
 # Tests check that every function equals its plain form, up to rounding. On a CPU most of the time
-# goes into memory traffic, so these functions avoid large arrays.
+# goes into memory traffic, so these functions avoid large arrays. `knn_by_matrix` is for GPUs.
 
 CHUNK = 192  # points in a chunk; 128 to 256 are about as fast
 # SPREAD_BITS[i]: byte i with its bits at every second position (its binary digits read in base 4)
@@ -1367,6 +1248,14 @@ def batched_fps(clouds, n):
 def build_tree(xyz):
     """cKDTree(xyz), with options that make it faster to build and its queries no slower."""
     return cKDTree(xyz, leafsize=48, balanced_tree=False, compact_nodes=False)
+
+
+def knn_by_matrix(x, y, k):
+    """`group_knn` by a matrix of distances: x (B,S,3), y (B,n,3) -> (B,S,k) indices into y."""
+    distances = torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist")  # accurate
+    idx = distances.topk(min(k, y.shape[1]), largest=False).indices  # (B,S,k), nearest first
+    missing = k - idx.shape[2]  # repeat the nearest when there are fewer than k points
+    return torch.cat([idx, idx[..., :1].expand(-1, -1, missing)], 2) if missing else idx
 
 
 def fast(net):
@@ -1532,7 +1421,7 @@ def linear_norm_relu_max(linear, norm, h):
 
 
 # ------------------------------------------------------------------------------------------------
-# 10  The command line
+# 10  The commands train and eval
 
 SIMULATED = Path("data/simulated")  # the simulated city, used without --data
 
@@ -1728,6 +1617,127 @@ def read_run(run):
         raise ValueError(f"{run}/config.json: missing or damaged, so there is no training run to "
                          "resume; give its folder with --out") from None
     return config, data, sequences, seed, weights
+
+
+def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", refine=0, plot=False,
+             say=print, network=D3DLO):
+    """Run the command `eval`: write trajectories and results.json, and print a table of errors.
+
+    data: a folder in KITTI's layout, or a plain folder of scans, which gives a trajectory only.
+        None: the simulated city.
+    weights: a weights file or the folder of a training run. None: the pretrained weights.
+    sequences: a list of names or splits. None: all, or the simulated test and validation splits.
+    out: the folder to write to. None: a new one, results/TIME.
+    device: cpu, cuda or mps.
+    refine: number of refinement passes, see `refine_pose`.
+    plot: also draw OUT/plot.png.
+    say: called with the text to print.
+    network: the class of the network.
+
+    Returns the folder `out`. Raises ValueError if an argument, the weights or the data are
+    invalid, and OSError if a file cannot be read or written.
+    """
+    odometry = Odometry(weights, device, refine, network)
+    if plot:
+        metrics.new_figure(1, 1)  # without matplotlib, fail now and not after the work
+    sequences = sequences or ("all" if data else ("test", "validation"))
+    root = data_root(data, sequences)
+    out = kitti.unused_path("results") if out is None else Path(out)
+    check_output(out, root)
+    chosen = kitti.open_sequences(root, sequences)
+    is_folder = isinstance(chosen[0], kitti.ScanFolder)
+    files = ["poses.txt", "poses.tum"] if is_folder else [f"{s.name}.txt" for s in chosen]
+    for_server = {f"{i}.txt" for i in range(11, 22)} <= set(files)  # KITTI's without ground truth
+    if for_server:
+        files.append("kitti-server.zip")
+    if plot:
+        files.append("plot.png")
+    check_results(out, files)
+    source = {"weights": str(weights or PRETRAINED), "data": str(root), "refine": refine,
+              "files": files}
+    if is_folder:
+        return evaluate_folder(odometry, chosen[0], out, source, say)
+
+    results = evaluate_sequences(odometry, chosen, out, source)
+    lines = [f"trajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)",
+             f"errors        {out}/results.json"]
+    if for_server:
+        lines.append(f"to submit     {zip_for_server(out)}")
+    if plot:
+        T = {s.name: (s.poses_cam, metrics.read_poses(out / f"{s.name}.txt")) for s in chosen}
+        metrics.draw(out / "plot.png", T)
+        lines.append(f"plot          {out}/plot.png (from above, errors by length)")
+    metrics.write_json(out / "results.json", source | results)
+    say("\n".join([results_table(results), *lines]))
+    return out
+
+
+def evaluate_folder(odometry, s, out, source, say=print):
+    """Predict the trajectory of a `kitti.ScanFolder`, with poses in the LiDAR's frame.
+
+    Writes OUT/poses.txt, OUT/poses.tum and OUT/results.json. Returns the folder OUT.
+    source: see `claim_results`.
+    """
+    (records,), _ = load_geometry([s], odometry.net.config)
+    poses = predict_poses(odometry, s, records)
+    claim_results(out, source)
+    metrics.write_poses(out / "poses.txt", poses)
+    kitti.write_tum(out / "poses.tum", poses, s.times)
+    length = metrics.path_lengths(poses)[-1]
+    lines = [f"{s.folder}: {len(s)} scans, path of {length:.1f} m",
+             *(f"note          {note}" for note in s.notes),
+             "frame         LiDAR at the first scan: x forward, y left, z up, in metres",
+             f"trajectory    {out}/poses.txt (12 numbers a line, as in KITTI's pose files)",
+             f"              {out}/poses.tum (t x y z qx qy qz qw, t in seconds)"]
+    if "plot.png" in source["files"]:
+        metrics.draw(out / "plot.png", {s.name: (None, poses)})
+        lines.append(f"plot          {out}/plot.png (from above)")
+    metrics.write_json(out / "results.json", source | {"path_m": length, "scans": len(s)})
+    say("\n".join(lines))
+    return out
+
+
+def earlier_results(out):
+    """The paths of the files in OUT that an earlier evaluation wrote, by OUT/results.json."""
+    try:
+        content = json.loads((out / "results.json").read_text(encoding="utf-8"))
+        if not {"data", "refine", "files"} <= content.keys():  # not ours
+            return []
+        names = [name for name in content["files"] if Path(name).name == name]
+    except (OSError, ValueError, TypeError, AttributeError):  # there is none, or it is not ours
+        return []
+    written = [name for name in names if Path(name).suffix in (".txt", ".tum", ".png", ".zip")]
+    return [out / name for name in (*written, "results.json") if (out / name).is_file()]
+
+
+def check_results(out, files):
+    """Raise ValueError if an evaluation that writes `files` to OUT would replace other files."""
+    earlier = earlier_results(out)
+    for path in [out / name for name in (*files, "results.json")]:
+        if path.exists() and path not in earlier:
+            raise ValueError(f"{path} exists and is not from an earlier evaluation there: move it, "
+                             "or choose another --out")
+
+
+def claim_results(out, source):
+    """Delete what an earlier evaluation wrote to OUT, and begin OUT/results.json with `source`.
+
+    source: weights, data, refine, and the list of files that will be written. So these files are
+    known to be ours even if the evaluation is interrupted.
+    """
+    for path in earlier_results(out):
+        path.unlink()
+    metrics.write_json(out / "results.json", source)
+
+
+def zip_for_server(out):
+    """Write OUT/kitti-server.zip, with 11.txt to 21.txt at its top level. Returns its path."""
+    path = out / "kitti-server.zip"
+    with metrics.replacing(path) as temporary:
+        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+            for i in range(11, 22):
+                archive.write(out / f"{i}.txt", f"{i}.txt")
+    return path
 
 
 def command_line(argv):

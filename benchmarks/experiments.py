@@ -132,8 +132,8 @@ class TwoBalls(nn.Module):
     def __init__(self, c, layer):
         super().__init__()
         self.r, self.n_n = layer.r / 2, max(1, layer.n_n // 4)  # of the small ball
-        self.small = MiniPointNet(c, layer.mlp)
-        self.large = MiniPointNet(c, layer.mlp)
+        self.small = MiniPointNet(c, layer.widths)
+        self.large = MiniPointNet(c, layer.widths)
 
     def forward(self, f):
         """Features of neighbours (C,S,k,c), the last three x_i - x'_j -> (C,S,2c')."""
@@ -149,7 +149,7 @@ class TwoScales(D3DLO):
     def __init__(self, config=Config()):
         super().__init__(config)
         self.sa1.mpn = TwoBalls(1 + 3, config.sa1)  # intensity and x_i - x'_j
-        self.fe = FlowEmbedding(2 * config.sa1.mlp[-1], config.fe)
+        self.fe = FlowEmbedding(2 * config.sa1.widths[-1], config.fe)
 
 
 class AppendCoordinates(nn.Module):
@@ -174,7 +174,7 @@ class Coordinates(D3DLO):
     def __init__(self, config=Config()):
         super().__init__(config)
         self.sa3 = AppendCoordinates(self.sa3)
-        self.mpn = MiniPointNet(config.sa3.mlp[-1] + 3, config.mpn.mlp)
+        self.mpn = MiniPointNet(config.sa3.widths[-1] + 3, config.mpn.widths)
 
 
 # ------------------------------------------------------------------------------------------------
