@@ -645,7 +645,7 @@ def mean_loss(net, objective, examples):
 
 
 def test_examples(geometry, motions, config, device):
-    """Yield (Batch, T) of 500 evenly spaced pairs in both directions, or of all if there are fewer."""
+    """Yield (Batch, T) of 500 evenly spaced pairs, or of all if fewer, in both directions."""
     pairs = all_pairs(motions)
     chosen = np.unique(np.linspace(0, len(pairs) - 1, 500).astype(int))
     as_they_are = replace(config, swap="both", augment=False)
