@@ -20,11 +20,11 @@ import ctypes
 import functools
 import hashlib
 import importlib.metadata
-import itertools
 import json
 import os
 import platform
 import re
+import secrets
 import shutil
 import signal
 import subprocess
@@ -35,7 +35,7 @@ import warnings
 import zlib
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -43,12 +43,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from metrics import is_rigid, path_lengths, read_poses, replacing, temporary_beside, write_poses
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
+from metrics import is_rigid, path_lengths, read_lines, read_poses, replacing, write_poses
 
 # Section 4 of the paper
 SPLITS = {
@@ -56,105 +51,6 @@ SPLITS = {
     "test": ("03", "04", "05", "06", "10"),
     "validation": ("07",),
 }
-
-# ------------------------------------------------------------------------------------------------
-# Files
-
-FIVE_FLOATS = ("nuScenes files have five floats per point: convert each with "
-               "np.save(NEW, np.fromfile(OLD, np.float32).reshape(-1, 5)[:, :4])")
-OTHER_FORMATS = b"\x93NUMPY", b"ply\n", b"ply\r", b"# .PCD"  # how files of other formats begin
-
-
-def _check_scan_size(path, size):
-    """Raise ValueError unless a .bin file of `size` bytes can hold a scan."""
-    if size == 0 or size % 16:
-        raise ValueError(f"{path} has {size} bytes, but a scan has 16 (four float32) per point: "
-                         "if it is truncated, copy or unpack it again; if it has other columns, "
-                         f"save x, y, z, intensity as .npy. {FIVE_FLOATS}.")
-
-
-def read_scan(path: str | Path, intensity_max: float = 1) -> np.ndarray:
-    """Read one scan, a .bin or .npy file.
-
-    Returns (N,4) float32: x, y, z [m] in the LiDAR's frame, and the intensity divided by
-    `intensity_max`. NaN is kept. A .bin file holds four float32 per point, like KITTI's. A .npy
-    file holds an array (N,3) or (N,4); without a fourth column the intensities are 0. Raises
-    OSError if the file cannot be read, and ValueError if it is empty, damaged or of another format.
-    """
-    path = Path(path)
-    scan = _read_npy(path) if path.suffix == ".npy" else _read_bin(path)
-    if intensity_max != 1:
-        scan[:, 3] /= intensity_max
-    return scan
-
-
-def _read_bin(path):
-    """A .bin file -> scan (N,4) float32."""
-    data = path.read_bytes()
-    if data.startswith(OTHER_FORMATS):
-        raise ValueError(f"{path} is not a KITTI scan but a file of another format: read it with "
-                         "its own library and save x, y, z, intensity as .npy.")
-    _check_scan_size(path, len(data))
-    return np.frombuffer(data, "<f4").reshape(-1, 4).astype(np.float32)  # (N,4), a writable copy
-
-
-def _read_npy(path):
-    """A .npy file -> scan (N,4) float32."""
-    try:
-        points = np.load(path, allow_pickle=False)
-    except OSError:
-        raise
-    except Exception:  # np.load raises many exception types; all of them mean a corrupt file
-        raise ValueError(f"{path} is damaged or not a NumPy file: save the scan again.") from None
-    shape = getattr(points, "shape", ())  # an archive of several arrays has no shape
-    if (len(shape) != 2 or shape[0] == 0 or shape[1] not in (3, 4)
-            or points.dtype.kind not in "fiu"):
-        raise ValueError(f"{path} has shape {shape}, but a scan is an array of numbers (N,3) or "
-                         "(N,4): save the columns x, y, z and intensity.")
-    scan = np.zeros((len(points), 4), np.float32)
-    with np.errstate(over="ignore"):  # numbers too large for float32 become infinite
-        scan[:, :points.shape[1]] = points
-    return scan
-
-
-def read_calib(path: str | Path) -> np.ndarray:
-    """Read the row `Tr` of a sequence's calib.txt.
-
-    Returns T_cam0_velo (4,4) float64, which maps points from the Velodyne frame to the frame of the
-    rectified left camera [m]. Raises FileNotFoundError if there is no such file, and ValueError if
-    `Tr` is missing or is not a finite rigid transform of 12 numbers.
-    """
-    path = Path(path)
-    remedy = ("KITTI's is in data_odometry_calib.zip; for drives of your own write the line "
-              "Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0")
-    if not path.is_file():
-        raise FileNotFoundError(f"{path} does not exist: {remedy}.")
-    row = _calib_row(path, "Tr", 12).reshape(3, 4)
-    if not is_rigid(row):
-        raise ValueError(f"{path} has no row 'Tr' (Velodyne to camera) of 12 finite numbers, a "
-                         f"rotation and a translation: {remedy}.")
-    return np.vstack([row, [0, 0, 0, 1]])  # (4,4)
-
-
-def _calib_row(path, name, count):
-    """The numbers (count,) of row `name` in a calibration file, NaN if there is no such row."""
-    rows = re.findall(rb"^\s*%s\s*:(.*)$" % name.encode(), path.read_bytes(), re.M)
-    try:
-        return np.array(rows[0].split(), dtype=float).reshape(count)
-    except (IndexError, ValueError):
-        return np.full(count, np.nan)
-
-
-def write_tum(path: str | Path, T: np.ndarray, times: np.ndarray) -> None:
-    """Write poses (n,4,4) at `times` (n,) [s] as a TUM trajectory file, through a temporary file.
-
-    A row is t x y z qx qy qz qw, with qw >= 0, in the frame of the poses. Raises ValueError if the
-    numbers of poses and times differ, and OSError if the file cannot be written.
-    """
-    q = Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True)  # (n,4)
-    with replacing(path) as temporary, open(temporary, "w", newline="\n") as file:
-        np.savetxt(file, np.c_[times, T[:, :3, 3], q], fmt="%.9f")
-
 
 # ------------------------------------------------------------------------------------------------
 # Frames
@@ -192,15 +88,12 @@ def to_vector(T: np.ndarray) -> np.ndarray:
     """
     T = np.asarray(T, dtype=float)
     flat = T.reshape(-1, 4, 4)
-    angles = np.empty((0, 3))
-    if len(flat):
-        with warnings.catch_warnings():
-            # At a pitch of +-90 degrees (gimbal lock), scipy warns and sets the third angle to
-            # zero. The rotation is still the same.
-            warnings.simplefilter("ignore", UserWarning)
-            angles = Rotation.from_matrix(flat[:, :3, :3]).as_euler("xyz", degrees=True)
-    vectors = np.concatenate([flat[:, :3, 3], angles], axis=1)
-    return vectors.reshape(T.shape[:-2] + (6,))
+    with warnings.catch_warnings():
+        # At a pitch of +-90 degrees (gimbal lock), scipy warns and sets the third angle to zero.
+        # The rotation is still the same.
+        warnings.simplefilter("ignore", UserWarning)
+        angles = Rotation.from_matrix(flat[:, :3, :3]).as_euler("xyz", degrees=True)
+    return np.concatenate([flat[:, :3, 3], angles], axis=1).reshape(*T.shape[:-2], 6)
 
 
 def from_vector(v: np.ndarray) -> np.ndarray:
@@ -208,55 +101,228 @@ def from_vector(v: np.ndarray) -> np.ndarray:
     v = np.asarray(v, dtype=float)
     flat = v.reshape(-1, 6)
     T = np.tile(np.eye(4), (len(flat), 1, 1))
-    if len(flat):
-        T[:, :3, :3] = Rotation.from_euler("xyz", flat[:, 3:], degrees=True).as_matrix()
+    T[:, :3, :3] = Rotation.from_euler("xyz", flat[:, 3:], degrees=True).as_matrix()
     T[:, :3, 3] = flat[:, :3]
-    return T.reshape(v.shape[:-1] + (4, 4))
+    return T.reshape(*v.shape[:-1], 4, 4)
 
 
 # ------------------------------------------------------------------------------------------------
-# Sequences
+# Scans, calibration and sequences
+
+FIVE_FLOATS = ("nuScenes files have five floats per point: convert each with "
+               "np.save(NEW, np.fromfile(OLD, np.float32).reshape(-1, 5)[:, :4])")
+OTHER_FORMATS = b"\x93NUMPY", b"ply\n", b"ply\r", b"# .PCD"  # how files of other formats begin
+
+
+def _check_size(path, size):
+    """Raise ValueError unless a .bin file of `size` bytes can hold a scan."""
+    if size == 0 or size % 16:
+        raise ValueError(f"{path} has {size} bytes, but a scan has 16 (four float32) per point: "
+                         "if it is truncated, copy or unpack it again; if it has other columns, "
+                         f"save x, y, z, intensity as .npy. {FIVE_FLOATS}.")
+
+
+def read_scan(path: str | Path, intensity_max: float = 1) -> np.ndarray:
+    """Read one scan, a .bin or .npy file.
+
+    Returns (N,4) float32: x, y, z [m] in the LiDAR's frame, and the intensity divided by
+    `intensity_max`. NaN is kept. A .bin file holds four float32 per point, like KITTI's. A .npy
+    file holds an array (N,3) or (N,4); without a fourth column the intensities are 0. Raises
+    OSError if the file cannot be read, and ValueError if it is empty, damaged or of another format.
+    """
+    path = Path(path)
+    if path.suffix == ".npy":
+        points = _read_npy(path)
+    else:
+        data = path.read_bytes()
+        if data.startswith(OTHER_FORMATS):
+            raise ValueError(f"{path} is not a KITTI scan but a file of another format: read it "
+                             "with its own library and save x, y, z, intensity as .npy.")
+        _check_size(path, len(data))
+        points = np.frombuffer(data, "<f4").reshape(-1, 4)
+    scan = np.zeros((len(points), 4), np.float32)
+    with np.errstate(over="ignore"):  # numbers too large for float32 become infinite
+        scan[:, :points.shape[1]] = points
+    scan[:, 3] /= intensity_max
+    return scan
+
+
+def _read_npy(path):
+    """The array (N,3) or (N,4) of a .npy file."""
+    try:
+        points = np.load(path, allow_pickle=False)
+    except OSError:
+        raise
+    except Exception:  # np.load raises many exception types; all of them mean a corrupt file
+        raise ValueError(f"{path} is damaged or not a NumPy file: save the scan again.") from None
+    shape = getattr(points, "shape", ())  # an archive of several arrays has no shape
+    if (len(shape) != 2 or shape[0] == 0 or shape[1] not in (3, 4)
+            or points.dtype.kind not in "fiu"):
+        raise ValueError(f"{path} has shape {shape}, but a scan is an array of numbers (N,3) or "
+                         "(N,4): save the columns x, y, z and intensity.")
+    return points
+
+
+def scans_in(folder):
+    """The *.bin and *.npy files of a folder, in natural order (2 before 10): list of paths.
+
+    Hidden files are ignored.
+    """
+    def with_padded_numbers(path):
+        return re.sub(r"\d+", lambda digits: digits[0].zfill(20), path.name)
+
+    paths = [path for path in Path(folder).glob("[!.]*") if path.suffix in (".bin", ".npy")]
+    return sorted(paths, key=with_padded_numbers)
+
+
+def read_calib(path: str | Path) -> np.ndarray:
+    """Read the row `Tr` of a sequence's calib.txt.
+
+    Returns T_cam0_velo (4,4) float64, which maps points from the Velodyne frame to the frame of the
+    rectified left camera [m]. Raises FileNotFoundError if there is no such file, and ValueError if
+    `Tr` is missing or is not a finite rigid transform of 12 numbers.
+    """
+    remedy = ("KITTI's is in data_odometry_calib.zip; for drives of your own write the line "
+              "Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0")
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path} does not exist: {remedy}.")
+    row = _calib_row(path, "Tr", 12).reshape(3, 4)
+    if not is_rigid(row):
+        raise ValueError(f"{path} has no row 'Tr' (Velodyne to camera) of 12 finite numbers, a "
+                         f"rotation and a translation: {remedy}.")
+    return np.vstack([row, [0, 0, 0, 1]])  # (4,4)
+
+
+def _calib_row(path, name, count):
+    """The numbers (count,) of row `name` in a calibration file, NaN if there is no such row."""
+    rows = [words[1:] for _, words in read_lines(path) if words[0] == f"{name}:"]
+    try:
+        return np.array(rows[0], dtype=float).reshape(count)
+    except (IndexError, ValueError):
+        return np.full(count, np.nan)
+
+
+def write_tum(path: str | Path, T: np.ndarray, times: np.ndarray) -> None:
+    """Write poses (n,4,4) at `times` (n,) [s] as a TUM trajectory file, through a temporary file.
+
+    A row is t x y z qx qy qz qw, with qw >= 0, in the frame of the poses. Raises ValueError if the
+    numbers of poses and times differ, and OSError if the file cannot be written.
+    """
+    q = Rotation.from_matrix(T[:, :3, :3]).as_quat(canonical=True)  # (n,4)
+    with replacing(path) as temporary, open(temporary, "w", newline="\n") as file:
+        np.savetxt(file, np.c_[times, T[:, :3, 3], q], fmt="%.9f")
 
 
 class Sequence:
-    """A sequence of ROOT in KITTI's layout. Its files are checked when it is opened.
+    """The scans of a drive, with ground truth where there is some. Checks its files when opened.
 
-    The files are ROOT/sequences/NAME/velodyne/000000.bin ..., ROOT/sequences/NAME/calib.txt and,
-    where there is ground truth, ROOT/poses/NAME.txt.
+    folder: ROOT/sequences/NAME of KITTI's layout, with velodyne/000000.bin ... and calib.txt, or
+        a plain folder of scans, *.bin or *.npy.
+    truth: in KITTI's layout, the path of the ground truth, ROOT/poses/NAME.txt, which need not
+        exist. None: a plain folder.
 
-    name, folder: its name and ROOT/sequences/NAME; scan_paths: list of n paths; Tr (4,4):
-    T_cam0_velo; poses_cam (n,4,4): the poses as in the file; poses (n,4,4): T_0t in the Velodyne
-    frame. Both are None without ground truth. Raises FileNotFoundError for a missing file, and
-    ValueError for a damaged one or if the numbers of scans and poses differ.
+    name, folder; scan_paths: list of n paths; intensity_max: intensities are divided by it;
+    Tr (4,4): T_cam0_velo; poses_cam (n,4,4): the poses as in the file; poses (n,4,4): T_0t in the
+    Velodyne frame. The last three are None in a plain folder, the poses also without ground truth.
+    times (n,) [s], of a plain folder only. notes: list of lines, one for each assumption made.
+    Raises FileNotFoundError for a missing file, and ValueError for a damaged one or if the files do
+    not fit together.
     """
 
-    intensity_max = 1  # intensities are divided by this; KITTI's are within 0..1
+    def __init__(self, folder, truth=None):
+        self.folder, self.name = Path(folder), Path(os.path.abspath(folder)).name
+        self.scan_paths = scans_in(self.folder / "velodyne" if truth else folder)
+        self.Tr = self.poses_cam = self.poses = None
+        self.intensity_max, self.notes = 1, []
+        if truth:
+            self._check_numbers()
+        if len({path.suffix for path in self.scan_paths}) > 1:
+            raise ValueError(f"{folder} holds both .bin and .npy files: move one kind elsewhere.")
+        for path in self.scan_paths:
+            if path.suffix == ".bin":
+                _check_size(path, path.stat().st_size)
+        if truth:
+            self._read_truth(truth)
+        else:
+            self._note_gaps()
+            self._scale_intensities()
+            self._read_times()
 
-    def __init__(self, root, name):
-        self.name = name
-        self.folder = Path(root) / "sequences" / name
-        velodyne = self.folder / "velodyne"
-        self.scan_paths = sorted(velodyne.glob("*.bin"))
+    def _check_numbers(self):
+        """Raise an error unless the scans are velodyne/000000.bin, 000001.bin and so on."""
         if not self.scan_paths:
-            raise FileNotFoundError(f"{velodyne} holds no scans: unpack "
+            raise FileNotFoundError(f"{self.folder / 'velodyne'} holds no scans: unpack "
                                     "data_odometry_velodyne.zip; the other archives hold none.")
         for i, path in enumerate(self.scan_paths):
             if path.name != f"{i:06d}.bin":
-                raise ValueError(f"{velodyne} should hold {i:06d}.bin next but holds {path.name}: "
-                                 "scans are numbered from 000000 without a gap; unpack "
-                                 "data_odometry_velodyne.zip again.")
-            _check_scan_size(path, path.stat().st_size)
-        self.Tr = read_calib(self.folder / "calib.txt")
+                raise ValueError(f"{path.parent} should hold {i:06d}.bin next but holds "
+                                 f"{path.name}: scans are numbered from 000000 without a gap; "
+                                 "unpack data_odometry_velodyne.zip again.")
 
-        self.poses_cam = self.poses = None
-        truth = Path(root) / "poses" / f"{name}.txt"
-        if truth.exists():
-            self.poses_cam = read_poses(truth)  # (n,4,4)
-            if len(self.poses_cam) != len(self):
-                raise ValueError(f"{truth} has {len(self.poses_cam)} poses but {velodyne} has "
-                                 f"{len(self)} scans: the numbers must agree; unpack the "
-                                 "incomplete archive again.")
-            self.poses = camera_to_velo(self.poses_cam, self.Tr)  # (n,4,4)
+    def _read_truth(self, truth):
+        """Read calib.txt and, if it exists, the ground truth."""
+        self.Tr = read_calib(self.folder / "calib.txt")
+        if not truth.exists():
+            return
+        self.poses_cam = read_poses(truth)  # (n,4,4)
+        if len(self.poses_cam) != len(self):
+            raise ValueError(f"{truth} has {len(self.poses_cam)} poses but {self.folder} has "
+                             f"{len(self)} scans: the numbers must agree; unpack the incomplete "
+                             "archive again.")
+        self.poses = camera_to_velo(self.poses_cam, self.Tr)  # (n,4,4)
+
+    def _note_gaps(self):
+        """Note missing scans if the files are numbered consecutively."""
+        if not all(path.stem.isdecimal() for path in self.scan_paths):
+            return
+        steps = np.diff([int(path.stem) for path in self.scan_paths])
+        gaps = np.flatnonzero(steps > 1)
+        if len(gaps) and np.median(steps) == 1:  # other numbers, such as times, have no gaps
+            self.notes.append(f"{(steps - 1).sum()} scans are missing, the first after "
+                              f"{self.scan_paths[gaps[0]].name}; the motion across a gap may be "
+                              "wrong")
+
+    def _scale_intensities(self):
+        """Set intensity_max to 1 or 255, from ten scans spread over the folder.
+
+        Raises ValueError for a value below 0 or above 255, which cannot be an intensity.
+        """
+        largest = 0
+        for i in np.unique(np.linspace(0, len(self) - 1, 10).astype(int)):
+            intensity = self.scan(i)[:, 3]
+            intensity = intensity[np.isfinite(intensity)]
+            if intensity.min(initial=0) < 0:
+                raise ValueError(f"{self.scan_paths[i]}: the fourth value of a point is "
+                                 f"{intensity.min():.4g}, but intensities are not negative, so "
+                                 f"this is not x, y, z, intensity. {FIVE_FLOATS}.")
+            if intensity.max(initial=0) > 255:
+                raise ValueError(f"{self.scan_paths[i]} has intensities up to "
+                                 f"{intensity.max():.4g}, but they must lie within 0..1 or "
+                                 "0..255: rescale those of all scans.")
+            largest = max(largest, intensity.max(initial=0))
+        if largest > 1:
+            self.intensity_max = 255
+            self.notes.append(f"intensities reach {largest:.4g}; all are divided by 255")
+        if largest == 0:
+            self.notes.append("there are no intensities; zeros are used, so expect larger errors")
+
+    def _read_times(self):
+        """Read times.txt, one time in seconds per line, or assume 10 scans a second."""
+        path = self.folder / "times.txt"
+        if not path.exists():
+            self.times = 0.1 * np.arange(len(self))
+            self.notes.append("no times.txt (one time in seconds per line); "
+                              "10 scans a second are assumed")
+            return
+        try:
+            self.times = np.array([words[0] for _, words in read_lines(path)], dtype=float)
+        except ValueError:
+            self.times = np.empty(0)
+        if len(self.times) != len(self) or not (np.isfinite(self.times).all()
+                                                and (np.diff(self.times) > 0).all()):
+            raise ValueError(f"{path} must hold {len(self)} increasing numbers, the time of each "
+                             "scan in seconds: correct it, or remove it to assume 10 scans a "
+                             "second.")
 
     def __len__(self):
         return len(self.scan_paths)
@@ -277,106 +343,22 @@ class Sequence:
                              f"{self.name}/poses.txt is not ground truth: SuMa estimated it).")
         return invert(self.poses[:-1]) @ self.poses[1:]
 
+    def fingerprint(self, scan_crcs):
+        """16 hex digits that identify the sequence by its content, in any folder.
 
-class ScanFolder(Sequence):
-    """A plain folder of scans as a sequence: *.bin or *.npy, in natural order (2 before 10).
-
-    name is the folder's. There is no calibration and no ground truth: Tr, poses_cam and poses are
-    None. Intensities are divided by intensity_max, 1 or 255. times (n,) are the seconds in the
-    folder's times.txt, or else those of 10 scans a second. notes is a list of lines, one for each
-    assumption made. Raises ValueError if the files do not fit together or are not scans.
-    """
-
-    def __init__(self, folder):
-        self.folder = Path(folder)
-        self.name = self.folder.resolve().name
-        self.scan_paths = scans_in(folder)
-        self.Tr = self.poses_cam = self.poses = None
-        if len({path.suffix for path in self.scan_paths}) > 1:
-            raise ValueError(f"{folder} holds both .bin and .npy files: move one kind elsewhere.")
-        for path in self.scan_paths:
-            if path.suffix == ".bin":
-                _check_scan_size(path, path.stat().st_size)
-
-        self.notes = _notes_on_gaps(self.scan_paths)
-        largest = _largest_intensity(self.scan_paths)
-        self.intensity_max = 255 if largest > 1 else 1
-        if largest == 0:
-            self.notes.append("there are no intensities; zeros are used, so expect larger errors")
-        if largest > 1:
-            self.notes.append(f"intensities reach {largest:.4g}; all are divided by 255")
-
-        if (self.folder / "times.txt").exists():
-            self.times = _read_times(self.folder / "times.txt", len(self))
-        else:
-            self.times = 0.1 * np.arange(len(self))
-            self.notes.append("no times.txt (one time in seconds per line); "
-                              "10 scans a second are assumed")
+        scan_crcs: the CRC-32 of every scan (n,) uint32. The poses are included.
+        """
+        poses = b"" if self.poses_cam is None else self.poses_cam.tobytes()
+        return hashlib.sha256(np.ascontiguousarray(scan_crcs).tobytes() + poses).hexdigest()[:16]
 
 
-def scans_in(folder):
-    """The *.bin and *.npy files of a folder, in natural order: list of paths."""
-    def with_padded_numbers(path):  # "2.bin" comes before "10.bin"
-        return re.sub(r"\d+", lambda digits: digits[0].zfill(20), path.name)
-
-    paths = [path for path in Path(folder).glob("[!.]*") if path.suffix in (".bin", ".npy")]
-    return sorted(paths, key=with_padded_numbers)
-
-
-def _notes_on_gaps(paths):
-    """A list with a line on missing scans, if the files are numbered consecutively."""
-    if not all(path.stem.isdecimal() for path in paths):
-        return []
-    steps = np.diff([int(path.stem) for path in paths])
-    gaps = np.flatnonzero(steps > 1)
-    if not len(gaps) or np.median(steps) != 1:  # other numbers, such as times, have no gaps
-        return []
-    return [f"{(steps - 1).sum()} scans are missing, the first after {paths[gaps[0]].name}; "
-            "the motion across a gap may be wrong"]
-
-
-def _largest_intensity(paths):
-    """The largest intensity in ten scans spread over a folder.
-
-    Raises ValueError for a value below 0 or above 255, which cannot be an intensity.
-    """
-    largest = 0
-    for i in np.unique(np.linspace(0, len(paths) - 1, 10).astype(int)):
-        intensity = read_scan(paths[i])[:, 3]
-        intensity = intensity[np.isfinite(intensity)]
-        if intensity.min(initial=0) < 0:
-            raise ValueError(f"{paths[i]}: the fourth value of a point is {intensity.min():.4g}, "
-                             "but intensities are not negative, so this is not x, y, z, intensity. "
-                             f"{FIVE_FLOATS}.")
-        if intensity.max(initial=0) > 255:
-            raise ValueError(f"{paths[i]} has intensities up to {intensity.max():.4g}, but they "
-                             "must lie within 0..1 or 0..255: rescale those of all scans.")
-        largest = max(largest, intensity.max(initial=0))
-    return largest
-
-
-def _read_times(path, n):
-    """Read the times (n,) [s] in a times.txt, one per line. Raises ValueError unless they increase.
-    """
-    try:
-        times = np.array(path.read_bytes().split(), dtype=float)
-    except ValueError:
-        times = np.empty(0)
-    if len(times) != n or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-        raise ValueError(f"{path} must hold {n} increasing numbers, the time of each scan in "
-                         "seconds: correct it, or remove it to assume 10 scans a second.")
-    return times
-
-
-def _is_plain_folder(root):
-    """Whether ROOT is a plain folder of scans and not KITTI's odometry layout."""
-    return not (Path(root) / "sequences").exists()
-
-
-def _is_raw_data(root):
-    """Whether ROOT looks like KITTI's raw data, a drive or a folder of drives."""
-    paths = root, *root.glob("*"), *root.glob("*/*")
-    return any(re.search(r"_drive_\d+|^velodyne_points$", path.name) for path in paths)
+def expand_splits(names):
+    """Names of sequences and splits, or one of them -> names of sequences, each once, in order."""
+    expanded = {}  # a dict keeps the order
+    for name in [names] if isinstance(names, str) else names:
+        members = sum(SPLITS.values(), ()) if name == "all" else SPLITS.get(name, (name,))
+        expanded |= dict.fromkeys(members)
+    return list(expanded)
 
 
 def sequence_names(root: str | Path) -> list[str]:
@@ -386,54 +368,49 @@ def sequence_names(root: str | Path) -> list[str]:
     there are no scans in a known layout.
     """
     root = Path(root)
-    if _is_plain_folder(root) and scans_in(root):
-        return [root.resolve().name]
-    folders = root.glob("sequences/[!.]*/velodyne")
-    names = sorted(folder.parent.name for folder in folders if any(folder.glob("*.bin")))
-    if not names:
-        remedy = "check the path and unpack its archives"
-        if not root.exists():
-            raise FileNotFoundError(f"{root}: no such folder; check the path.")
-        if root.is_file():
-            raise FileNotFoundError(f"{root} is a file: give the folder that holds the scans.")
-        if _is_raw_data(root):
-            remedy = "convert KITTI's raw data with `python kitti.py raw DRIVE ROOT`"
-        elif any(path.suffix.lower() in (".pcd", ".ply", ".las") for path in root.iterdir()):
-            remedy = "save the points of each file as .npy, (N,4): x, y, z, intensity"
-        raise FileNotFoundError(
-            f"{root} has no scans in a known layout: {remedy}. Known layouts: a folder of *.bin or "
-            "*.npy files, and KITTI's odometry layout, ROOT/sequences/00/{velodyne/000000.bin, "
-            "calib.txt} and ROOT/poses/00.txt.")
-    return names
+    if not (root / "sequences").exists() and scans_in(root):
+        return [Path(os.path.abspath(root)).name]
+    names = sorted(velodyne.parent.name for velodyne in root.glob("sequences/[!.]*/velodyne")
+                   if any(velodyne.glob("[!.]*.bin")))
+    if names:
+        return names
+    if not root.exists():
+        raise FileNotFoundError(f"{root}: no such folder; check the path.")
+    if root.is_file():
+        raise FileNotFoundError(f"{root} is a file: give the folder that holds the scans.")
+    remedy = "check the path and unpack its archives"
+    paths = root, *root.glob("*"), *root.glob("*/*")
+    if any(re.search(r"_drive_\d+|^velodyne_points$", path.name) for path in paths):
+        remedy = "convert KITTI's raw data with `python kitti.py raw DRIVE ROOT`"
+    elif any(path.suffix.lower() in (".pcd", ".ply", ".las") for path in paths):
+        remedy = "save the points of each file as .npy, (N,4): x, y, z, intensity"
+    raise FileNotFoundError(
+        f"{root} has no scans in a known layout: {remedy}. Known layouts: a folder of *.bin or "
+        "*.npy files, and KITTI's odometry layout, ROOT/sequences/00/{velodyne/000000.bin, "
+        "calib.txt} and ROOT/poses/00.txt.")
 
 
 def open_sequences(root: str | Path, names: str | list[str] = "all") -> list[Sequence]:
     """Open sequences of ROOT, in the order given, each once.
 
     names: one or several names of folders under ROOT/sequences, splits of SPLITS, or "all".
-    Sequences of a split that ROOT lacks are skipped. A ROOT without a folder
-    sequences/ is one `ScanFolder`. Raises ValueError for a name or split with no sequence in ROOT,
-    and the errors of `sequence_names`, `Sequence` and `ScanFolder`.
+    Sequences of a split that ROOT lacks are skipped. A ROOT without a folder sequences/ is a plain
+    folder of scans, one sequence. Raises ValueError for a name or split with no sequence in ROOT,
+    and the errors of `sequence_names` and `Sequence`.
     """
-    available = sequence_names(root)
-    choices = {}
-    for split, members in SPLITS.items():
-        choices[split] = [name for name in members if name in available]
-    choices["all"] = available
-    for name in available:
-        choices[name] = [name]
-
-    names = [names] if isinstance(names, str) else names
-    chosen = {}  # a dict keeps the order
-    for name in names:
-        if not choices.get(name):
-            known = " ".join(choice for choice, members in choices.items() if members)
+    root, available, chosen = Path(root), sequence_names(root), []
+    for name in [names] if isinstance(names, str) else names:
+        members = available if name == "all" else expand_splits(name)
+        members = [member for member in members if member in available]
+        if not members:
+            splits = [split for split in SPLITS if set(SPLITS[split]) & set(available)]
             raise ValueError(f"{root} has no sequence or split {name!r} with scans: choose from "
-                             f"{known}.")
-        chosen |= dict.fromkeys(choices[name])
-    if _is_plain_folder(root):
-        return [ScanFolder(root) for _ in chosen]
-    return [Sequence(root, name) for name in chosen]
+                             f"{' '.join([*splits, 'all', *available])}.")
+        chosen += members
+    if not (root / "sequences").exists():
+        return [Sequence(root)]
+    return [Sequence(root / "sequences" / name, root / "poses" / f"{name}.txt")
+            for name in dict.fromkeys(chosen)]
 
 
 # ------------------------------------------------------------------------------------------------
@@ -461,22 +438,17 @@ def usable_points(scan, max_range=None, plane=True):
         x, y, z, intensity = scan.T  # (N,) each
         squared_range = x * x + y * y + z * z
         # A comparison with NaN is false
-        in_range = squared_range < MAX_VALID_RANGE**2
-        intact = in_range & (np.abs(intensity) < MAX_VALID_INTENSITY)
+        valid = (squared_range < MAX_VALID_RANGE**2) & (np.abs(intensity) < MAX_VALID_INTENSITY)
         near = squared_range < (max_range or MAX_VALID_RANGE) ** 2
-    broken = np.count_nonzero(~intact)
-    kept = scan[intact & near]  # (M,4)
-    if not plane:
-        kept = remove_plane(kept)
-    return kept, broken
+    kept = scan[valid & near]  # (M,4)
+    return kept if plane else remove_plane(kept), np.count_nonzero(~valid)
 
 
 def scan_stats(scan, centroids):
     """Usable points (M,4) and the centroids sampled from them (S,3) -> STATS (4,) of the scan."""
     height = np.clip(scan[:, 2], -100, 100)
     layer = np.floor(height / 0.3).astype(int)  # (M,)
-    points_in_layer = np.bincount(layer - layer.min())
-    ground_share = points_in_layer.max() / len(scan)
+    ground_share = np.bincount(layer - layer.min()).max() / len(scan)
     centroid_range = np.linalg.norm(centroids, axis=1)  # (S,)
     mean_intensity = scan[:, 3].mean(dtype=float)
     return np.array([len(scan), mean_intensity, np.median(centroid_range), ground_share])
@@ -488,11 +460,9 @@ def domain_shift(stats, seen):
     stats: STATS (4,); seen (2,4): the smallest and largest values in training. Returns a text,
     empty if there are none.
     """
-    shifts = []
-    for name, x, low, high in zip(STATS, stats, *seen):
-        if not low / 1.5 <= x <= high * 1.5:
-            shifts.append(f"{name} {x:.3g} (in training {low:.3g} to {high:.3g})")
-    return "; ".join(shifts)
+    return "; ".join(f"{name} {x:.3g} (in training {low:.3g} to {high:.3g})"
+                     for name, x, low, high in zip(STATS, stats, *seen)
+                     if not low / 1.5 <= x <= high * 1.5)
 
 
 def remove_plane(scan: np.ndarray, threshold=0.15, max_tilt=15.0, hypotheses=400, subsample=4000,
@@ -500,66 +470,51 @@ def remove_plane(scan: np.ndarray, threshold=0.15, max_tilt=15.0, hypotheses=400
     """Remove the ground plane from a scan by RANSAC, section 4 of the paper.
 
     (N,3) or more columns -> the points that are `threshold` metres or more away from the dominant
-    plane whose normal is within `max_tilt` degrees of vertical. `hypotheses` planes through three
-    random points are scored on `subsample` random points. The best is fitted twice to all its
-    inliers. Order and non-finite points are kept. The scan is unchanged if no plane qualifies.
+    plane n . x = d whose normal n is within `max_tilt` degrees of vertical. `hypotheses` planes
+    through three random points are scored on `subsample` random points. The best is fitted twice
+    to all its inliers. Order and non-finite points are kept. The scan is unchanged if no plane
+    qualifies.
     """
     xyz = np.ascontiguousarray(scan[:, :3], dtype=np.float32)  # (N,3)
     finite = np.flatnonzero(np.isfinite(xyz).all(axis=1))
     if len(finite) < 3:
         return scan
     rng, min_cosine = np.random.default_rng(seed), np.cos(np.radians(max_tilt))
-    # Hypotheses: planes through three random points, scored on a random sample
-    triples = xyz[finite[rng.integers(len(finite), size=(3, hypotheses))]]  # (3,H,3)
+
+    def inliers(points, n, d):
+        with np.errstate(invalid="ignore", over="ignore"):  # NaN is never an inlier
+            return np.abs(points @ n.astype(np.float32) - d.astype(np.float32)) < threshold
+
+    # Hypotheses: planes through three random points
+    a, b, c = xyz[finite[rng.integers(len(finite), size=(3, hypotheses))]].astype(float)  # (H,3)
     sample = xyz[finite[rng.integers(len(finite), size=min(subsample, len(finite)))]]  # (M,3)
-    plane = _best_plane(triples, sample, threshold, min_cosine)
-    for _ in range(2):  # refine the best one by least squares
-        if plane is not None:
-            plane = _fit_plane(xyz[_plane_inliers(xyz, *plane, threshold)])
-    if plane is None or abs(plane[0][2]) < min_cosine:  # too steep: a wall, for example
-        return scan
-    return scan[~_plane_inliers(xyz, *plane, threshold)]
-
-
-def _best_plane(triples, sample, threshold, min_cosine):
-    """The plane n . x = d with the most inliers: (n (3,), d), or None if none is near level.
-
-    triples (3,H,3): three points for each of H planes; sample (M,3): the points to score them on.
-    """
-    a, b, c = triples.astype(float)  # (H,3) each
     normal = np.cross(b - a, c - a)  # (H,3)
     length = np.linalg.norm(normal, axis=1)
-    upright = np.abs(normal[:, 2]) > min_cosine * np.maximum(length, 1e-9)
-    if not upright.any():
-        return None
-    normal = normal[upright] / length[upright, None]
-    offset = (normal * a[upright]).sum(axis=1)  # (H,)
-    projected = normal.astype(np.float32) @ sample.T  # (H,M)
-    distance = np.abs(projected - offset[:, None].astype(np.float32))  # (H,M)
-    best = (distance < threshold).sum(axis=1).argmax()
-    return normal[best], offset[best]
+    level = np.abs(normal[:, 2]) > min_cosine * np.maximum(length, 1e-9)
+    if not level.any():
+        return scan
+    normal = normal[level] / length[level, None]
+    offset = (normal * a[level]).sum(axis=1)  # (H,)
 
-
-def _fit_plane(points):
-    """The least-squares plane n . x = d of points (m,3): (n (3,), d), or None for fewer than 3."""
-    if len(points) < 3:
-        return None
-    mean = points.mean(axis=0, dtype=float)
-    centred = points - mean.astype(np.float32)
-    covariance = (centred.T @ centred).astype(float)  # (3,3), times m
-    _, directions = np.linalg.eigh(covariance)  # by increasing variance
-    n = directions[:, 0]  # the direction in which the points vary least
-    return n, n @ mean
-
-
-def _plane_inliers(xyz, n, d, threshold):
-    """Which points (N,3) are within `threshold` of the plane n . x = d: (N,) bool."""
-    with np.errstate(invalid="ignore", over="ignore"):  # NaN is never an inlier
-        return np.abs(xyz @ n.astype(np.float32) - np.float32(d)) < threshold
+    # Take the one with the most inliers in the sample; fit it to all its inliers
+    best = inliers(sample, normal.T, offset).sum(axis=0).argmax()
+    n, d = normal[best], offset[best]
+    for _ in range(2):
+        points = xyz[inliers(xyz, n, d)]
+        if len(points) < 3:
+            return scan
+        mean = points.mean(axis=0, dtype=float)
+        centred = points - mean.astype(np.float32)
+        _, directions = np.linalg.eigh((centred.T @ centred).astype(float))
+        n = directions[:, 0]  # the direction in which the points vary least
+        d = n @ mean
+    if abs(n[2]) < min_cosine:  # too steep: a wall, for example
+        return scan
+    return scan[~inliers(xyz, n, d)]
 
 
 # ------------------------------------------------------------------------------------------------
-# Long work: progress, processes, signals, folders of training runs
+# Long work: progress, processes, cache
 
 
 def progress(items, total, what):
@@ -576,9 +531,7 @@ def progress(items, total, what):
         rate = done / max(time.monotonic() - began, 1e-9)
         minutes, seconds = divmod(round((total - done) / rate), 60)
         line = f"{what}: {done}/{total}, {rate:.3g} /s, {minutes}:{seconds:02d} left"
-        if tty:
-            line = f"\r{line:<79}"
-        print(line, end=end, file=sys.stderr, flush=True)
+        print(f"\r{line:<79}" if tty else line, end=end, file=sys.stderr, flush=True)
 
     try:
         for item in items:
@@ -596,10 +549,8 @@ def progress(items, total, what):
 def cores():
     """Number of cores this process may use, at most 61: Windows allows no more worker processes."""
     if hasattr(os, "sched_getaffinity"):
-        count = len(os.sched_getaffinity(0))
-    else:
-        count = os.cpu_count() or 1
-    return min(count, 61)
+        return min(len(os.sched_getaffinity(0)), 61)
+    return min(os.cpu_count() or 1, 61)
 
 
 def in_processes(function, tasks, workers=None, chunksize=4):
@@ -647,8 +598,7 @@ def keep_freed_memory():
 
 def versions(folder):
     """Versions of Python and the packages, and the git commit of the code in `folder`, if any."""
-    commit = None
-    git = shutil.which("git")
+    commit, git = None, shutil.which("git")
     if git and (Path(folder) / ".git").exists():
         describe = [git, "-C", folder, "describe", "--always", "--dirty"]
         commit = subprocess.run(describe, capture_output=True, text=True).stdout.strip()
@@ -656,115 +606,33 @@ def versions(folder):
     return {"commit": commit, "python": platform.python_version(), **packages}
 
 
-def unused_path(parent):
-    """A path PARENT/TIME that does not exist yet."""
-    path = first = Path(parent) / time.strftime("%Y-%m-%d-%H%M%S")
-    for i in itertools.count(2):
-        if not path.exists():
-            return path
-        path = first.with_name(f"{first.name}-{i}")
-
-
-@contextmanager
-def run_folder(path):
-    """Make a folder and lock it for one writer. If it is new and still empty at the end, remove it.
-
-    The lock is on the file PATH/lock, which nothing else opens. The system releases it when the
-    process ends or is killed. Without fcntl, as on Windows, nothing is locked. Raises ValueError if
-    another process has locked the folder.
-    """
-    made = [folder for folder in (path, *path.parents) if not folder.exists()]
-    path.mkdir(parents=True, exist_ok=True)
-    with open(path / "lock", "a+", encoding="utf-8") as lock:
-        if fcntl:
-            try:
-                fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                lock.seek(0)
-                holder = lock.read().strip() or "just started"
-                raise ValueError(f"{path}: in use by another training run ({holder}); wait until "
-                                 "it has ended, or choose another folder") from None
-        lock.truncate(0)
-        lock.write(f"process {os.getpid()} on {platform.node()}\n")
-        lock.flush()
-        try:
-            yield
-        finally:
-            if made and [file.name for file in path.iterdir()] == ["lock"]:
-                (path / "lock").unlink()
-                with suppress(OSError):  # another process has just begun to use it
-                    for folder in made:
-                        folder.rmdir()
-
-
-@contextmanager
-def delayed_interrupt():
-    """Delay Ctrl-C and SIGTERM. Yields a list to which the first signal is added.
-
-    A second signal interrupts at once. Outside the main thread, where Python allows no signal
-    handlers, nothing is delayed.
-    """
-    received, handlers = [], {}
-
-    def note(number, frame):
-        if received:
-            raise KeyboardInterrupt
-        received.append(number)
-
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):
-            handlers[number] = signal.signal(number, note)
-    try:
-        yield received
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, signal.SIG_DFL if handler is None else handler)
-
-
-# ------------------------------------------------------------------------------------------------
-# Cache
-
-
 def cached_records(sequences, compute, dtype, settings, cache="cache"):
     """Compute a record for every scan and store it. Later calls read the stored records.
 
-    sequences: a list of `Sequence`; compute: a picklable function from a scan (N,4) to a record of
-    `dtype`; settings: everything else that the records depend on; cache: the folder of the files.
-    Returns two lists with an entry for each sequence: records (n,), memory-mapped, and
-    the CRC-32 of every scan (n,) uint32, from which `fingerprint` identifies the data.
+    sequences: a list of `Sequence`; compute: a picklable function from (path of a scan,
+    intensity_max) to a record of `dtype`; settings: everything else that the records depend on;
+    cache: the folder of the files. Returns a list with the records (n,) of each sequence,
+    memory-mapped. The work is spread over all cores.
 
-    A file's name contains a hash of the settings, the folder, and every scan's size and times, so a
-    stale file is never read. A damaged file is computed again. Files are moved into place when they
-    are complete, so two processes may share a cache. The work is spread over all cores. Raises
-    ValueError, naming the file, for a scan that `compute` rejects.
+    A file's name is a hash of all it depends on, and files are moved into place when complete, so
+    two processes may share a cache. A file that NumPy cannot read is computed again.
     """
-    row_dtype = np.dtype([("record", dtype), ("scan_crc", "u4"), ("crc", "u4")])
     files = [Path(cache) / f"{s.name}-{_cache_key(s, settings, dtype)}.npy" for s in sequences]
-    missing = [(s, file) for s, file in zip(sequences, files)
-               if not _is_intact(file, row_dtype, len(s))]
-    if missing:
-        _write_cache(missing, compute, row_dtype)
-    loaded = [np.load(file, mmap_mode="r") for file in files]
-    records = [rows["record"] for rows in loaded]
-    scan_crcs = [np.array(rows["scan_crc"]) for rows in loaded]
-    return records, scan_crcs
-
-
-def _write_cache(missing, compute, row_dtype):
-    """Compute and write the cache files of a list of (sequence, file)."""
+    missing = [(s, file) for s, file in zip(sequences, files) if not _is_intact(file, dtype, s)]
     tasks = [(path, s.intensity_max) for s, _ in missing for path in s.scan_paths]
-    compute_row = functools.partial(_cache_row, compute=compute, row_dtype=row_dtype)
-    with closing(in_processes(compute_row, tasks)) as rows:
-        rows = progress(rows, len(tasks), "sampling and grouping, scans")
-        for s, file in missing:
-            header = {"descr": np.lib.format.dtype_to_descr(row_dtype), "fortran_order": False,
-                      "shape": (len(s),)}
-            # Written row by row: a memory map would crash on a full disk
-            with replacing(file) as temporary, open(temporary, "wb") as out:
-                np.lib.format.write_array_header_1_0(out, header)
-                for _ in range(len(s)):
-                    out.write(next(rows))
-        next(rows, None)  # lets the progress line end
+    if tasks:
+        with closing(in_processes(compute, tasks)) as records:
+            records = progress(records, len(tasks), "sampling and grouping, scans")
+            for s, file in missing:
+                header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False,
+                          "shape": (len(s),)}
+                # Written record by record: a memory map would crash on a full disk
+                with replacing(file) as temporary, open(temporary, "wb") as out:
+                    np.lib.format.write_array_header_1_0(out, header)
+                    for _ in range(len(s)):
+                        out.write(next(records).tobytes())
+            next(records, None)  # lets the progress line end
+    return [np.load(file, mmap_mode="r") for file in files]
 
 
 def _cache_key(sequence, settings, dtype):
@@ -778,46 +646,30 @@ def _cache_key(sequence, settings, dtype):
     return hashlib.sha256(repr(depends).encode()).hexdigest()[:16]
 
 
-def _cache_row(task, compute, row_dtype):
-    """Task (path of a scan, intensity_max) -> the bytes of its row in a cache file."""
-    path, intensity_max = task
-    scan = read_scan(path, intensity_max)
-    row = np.zeros((), row_dtype)
-    row["scan_crc"] = zlib.crc32(scan)
-    try:
-        row["record"] = compute(scan)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    row["crc"] = zlib.crc32(row.tobytes()[:-4])  # of the row without its last field, the CRC
-    return row.tobytes()
-
-
-def _is_intact(file, row_dtype, n):
-    """Whether a cache file exists, holds n rows and has the right checksums.
-
-    Reports a damaged file on stderr.
-    """
+def _is_intact(file, dtype, sequence):
+    """Whether a cache file exists and holds a record for every scan. Reports a damaged one."""
     if not file.is_file():
         return False
     try:
-        rows = np.load(file, mmap_mode="r")  # pickles are off by default, so no code runs
-        if rows.dtype == row_dtype:
-            content = rows.view(np.uint8).reshape(n, -1)  # (n,bytes of a row)
-            if all(zlib.crc32(row[:-4]) == crc for row, crc in zip(content, rows["crc"])):
-                return True
+        records = np.load(file, mmap_mode="r")  # pickles are off by default, so no code runs
+        if (records.dtype, records.shape) == (dtype, (len(sequence),)):
+            return True
     except Exception:  # np.load raises many exception types; all of them mean a corrupt file
         pass
     print(f"{file}: damaged, so it is computed again", file=sys.stderr)
     return False
 
 
-def fingerprint(sequence, scan_crcs):
-    """16 hex digits that identify a sequence by its content: the CRC of every scan, and the poses.
-
-    They do not depend on the folder or on file times.
-    """
-    poses = b"" if sequence.poses_cam is None else sequence.poses_cam.tobytes()
-    return hashlib.sha256(scan_crcs.tobytes() + poses).hexdigest()[:16]
+@contextmanager
+def new_folder(path):
+    """Yield a temporary folder beside `path`, and move it to `path` if the block succeeds."""
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    temporary.mkdir(parents=True)
+    try:
+        yield temporary
+        temporary.rename(path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 # ------------------------------------------------------------------------------------------------
@@ -853,8 +705,8 @@ def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int
     Raises FileNotFoundError for a missing file, naming its archive, and ValueError for a damaged
     one or if ROOT holds such a sequence already. ROOT is then unchanged.
     """
-    drive, root = Path(drive), Path(root)
-    match = re.fullmatch(r"((\d{4}_\d\d_\d\d)_drive_\d+)_sync", drive.resolve().name)
+    drive, root = Path(os.path.abspath(drive)), Path(root)  # a link keeps its own place
+    match = re.fullmatch(r"((\d{4}_\d\d_\d\d)_drive_\d+)_sync", drive.name)
     if not match:
         raise ValueError(f"{drive} is not a drive of KITTI's raw data: give a folder such as "
                          "2011_09_26/2011_09_26_drive_0013_sync, of the synced+rectified data.")
@@ -862,63 +714,40 @@ def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int
     archive = f"{name}_sync.zip"
     numbers, scans, times = _raw_stream(drive / "velodyne_points", ".bin", archive)
     _, packets, packet_times = _raw_stream(drive / "oxts", ".txt", archive)
-    Tr, T_velo_imu = _raw_calib(drive.resolve().parent, f"{date}_calib.zip")
+    Tr, T_velo_imu = _raw_calib(drive.parent, f"{date}_calib.zip")
     for path in scans:
-        _check_scan_size(path, path.stat().st_size)
+        _check_size(path, path.stat().st_size)
 
-    # The nearest packet of each scan
+    # The nearest packet of each scan, and the poses
     nearest = np.array([np.abs(packet_times - t).argmin() for t in times])  # (n,)
     delay = times - packet_times[nearest]  # (n,)
     has_pose = np.flatnonzero(np.abs(delay) < MAX_DELAY)
     if not len(has_pose):
         raise ValueError(f"{drive}: no scan was taken within 0.1 s of a GPS/IMU packet; "
                          f"unpack {archive} again.")
-    parts = _split_at_gaps(name, numbers, has_pose)
     packets = np.stack([_read_packet(path) for path in packets])  # (m,30)
     T_imu = _imu_poses(packets, nearest, delay / SECOND)  # (n,4,4)
-    _write_raw_sequences(root, parts, scans, times, T_imu, Tr, T_velo_imu)
-    return {part: (int(numbers[run[0]]), int(numbers[run[-1]])) for part, run in parts.items()}
+    poses = velo_to_camera(T_imu, Tr @ T_velo_imu)  # from the IMU's frame to the camera's
 
-
-def _split_at_gaps(name, numbers, chosen):
-    """Split the chosen scans where their numbers have a gap -> {name of a sequence: its scans}.
-
-    numbers (n,): the number of each scan in the drive; chosen: indices of scans.
-    """
-    gaps = np.flatnonzero(np.diff(numbers[chosen]) != 1) + 1
-    runs = np.split(chosen, gaps)  # runs of consecutive scans
+    # Split the drive at the gaps, and write all parts or none
+    runs = np.split(has_pose, np.flatnonzero(np.diff(numbers[has_pose]) != 1) + 1)
     names = [name] if len(runs) == 1 else [f"{name}-{i + 1}" for i in range(len(runs))]
-    return dict(zip(names, runs))
-
-
-def _write_raw_sequences(root, parts, scans, times, T_imu, Tr, T_velo_imu):
-    """Write all sequences of a drive and their ground truth, or raise an error and write none.
-
-    parts: {name: indices of its scans}; scans: paths; times (n,) and T_imu (n,4,4): of all scans.
-    """
-    folders = {part: root / "sequences" / part for part in parts}
-    truths = {part: root / "poses" / f"{part}.txt" for part in parts}
-    for path in (*folders.values(), *truths.values()):
+    for path in [root / "sequences" / name for name in names] + [
+            root / "poses" / f"{name}.txt" for name in names]:
         if path.exists():
             raise ValueError(f"{path} already exists: remove it or choose another ROOT.")
-    temporary = {part: temporary_beside(folder) for part, folder in folders.items()}
-    try:
-        for part, run in parts.items():
-            _write_raw_sequence(temporary[part], [scans[i] for i in run], Tr, times[run])
-        for part, run in parts.items():
-            T = invert(T_imu[run[0]]) @ T_imu[run]  # relative to the first pose
-            T_cam = velo_to_camera(T, Tr @ T_velo_imu)  # from the IMU's frame to the camera's
-            write_poses(truths[part], T_cam)
-            temporary[part].rename(folders[part])
-    finally:
-        for folder in temporary.values():
-            shutil.rmtree(folder, ignore_errors=True)
+    with ExitStack() as parts:
+        for name, run in zip(names, runs):
+            folder = parts.enter_context(new_folder(root / "sequences" / name))
+            _write_raw_sequence(folder, [scans[i] for i in run], Tr, times[run])
+        for name, run in zip(names, runs):
+            write_poses(root / "poses" / f"{name}.txt", invert(poses[run[0]]) @ poses[run])
+    return {name: (int(numbers[run[0]]), int(numbers[run[-1]])) for name, run in zip(names, runs)}
 
 
 def _write_raw_sequence(folder, scans, Tr, times):
     """Write the scans, calib.txt and times.txt of a sequence in odometry layout."""
-    shutil.rmtree(folder, ignore_errors=True)  # left by an earlier process with the same id
-    (folder / "velodyne").mkdir(parents=True)
+    (folder / "velodyne").mkdir()
     for i, scan in enumerate(progress(scans, len(scans), "linking or copying scans")):
         target = folder / "velodyne" / f"{i:06d}.bin"
         try:
@@ -1846,16 +1675,6 @@ def _calibration():
     return Tr, "".join(lines)
 
 
-def expand_splits(sequences):
-    """Names of sequences and splits -> names of sequences, each once."""
-    names = [sequences] if isinstance(sequences, str) else sequences
-    expanded = {}  # a dict keeps the order
-    for name in names:
-        members = sum(SPLITS.values(), ()) if name == "all" else SPLITS.get(name, (name,))
-        expanded |= dict.fromkeys(members)
-    return list(expanded)
-
-
 def default_scans(name):
     """Number of scans that `simulate` makes for a sequence unless told otherwise.
 
@@ -1864,48 +1683,38 @@ def default_scans(name):
     return 170 if name in SPLITS["test"] + SPLITS["validation"] else 320
 
 
-def _missing_sequences(root, names, seed, scans, azimuth):
-    """{name: settings} of the sequences that are not in ROOT yet.
-
-    ValueError for a name that cannot be a folder, and for a sequence in ROOT that is not simulated
-    or has other settings.
-    """
-    missing = {}
-    for name in names:
-        if not isinstance(name, str) or name in ("", ".", "..") or re.search(r"[/\\\0]", name):
-            raise ValueError(f"The sequence name {name!r} is no plain folder name: use one such "
-                             "as '00'.")
-        settings = {"city": CITY, "seed": int(seed), "scans": int(scans or default_scans(name)),
-                    "azimuth": int(azimuth)}
-        folder, truth = root / "sequences" / name, root / "poses" / f"{name}.txt"
-        if folder.exists() or truth.exists():
-            # Another process may be making it, so look at its settings only now
-            made = folder / "simulated.json"
-            found = made.read_text() if made.exists() else "not simulated"
-            city = re.match(r'\{"city": (\d+)', found)
-            if city and int(city[1]) != CITY:
-                raise ValueError(f"{root} has scans of the simulated city, version {city[1]}, but "
-                                 f"this code makes version {CITY}: delete or rename that folder, "
-                                 "then run the same command again.")
-            if found != json.dumps(settings):
-                raise ValueError(f"{folder} or {truth} is there already, {found} and not "
-                                 f"{json.dumps(settings)}: choose another folder.")
-        if not (folder.exists() and truth.exists()):
-            missing[name] = settings
-    return missing
+def _is_complete(root, name, settings):
+    """Whether ROOT holds this sequence, simulated with these settings. ValueError for any other."""
+    folder, truth = root / "sequences" / name, root / "poses" / f"{name}.txt"
+    if not (folder.exists() or truth.exists()):
+        return False
+    made = folder / "simulated.json"
+    found = made.read_text() if made.exists() else "not simulated"
+    city = re.match(r'\{"city": (\d+)', found)
+    if city and int(city[1]) != CITY:
+        raise ValueError(f"{root} has scans of the simulated city, version {city[1]}, but this "
+                         f"code makes version {CITY}: delete or rename that folder, then run the "
+                         "same command again.")
+    if found != json.dumps(settings) or not truth.exists():
+        raise ValueError(f"{folder} or {truth} is there already, {found} and not "
+                         f"{json.dumps(settings)}: choose another folder.")
+    return True
 
 
-def _finish_sequence(temporary, folder, settings, calib):
-    """Add the small files of a sequence to its temporary folder, and move it to its place."""
-    seconds = [0.1 * i for i in range(settings["scans"])]
-    (temporary / "calib.txt").write_text(calib)
-    (temporary / "times.txt").write_text("".join(f"{t:.6e}\n" for t in seconds))
-    (temporary / "simulated.json").write_text(json.dumps(settings))
-    try:
-        temporary.rename(folder)
-    except OSError:  # another process was faster, or it cannot be renamed
-        if not (folder / "simulated.json").exists():
-            raise
+def _simulate_sequence(root, name, settings, workers):
+    """Write ROOT/sequences/NAME and ROOT/poses/NAME.txt. The folder appears when complete."""
+    T, (Tr, calib) = _world(name, settings["seed"], settings["scans"]).T, _calibration()
+    with new_folder(root / "sequences" / name) as folder:
+        (folder / "velodyne").mkdir()
+        tasks = [(folder / "velodyne" / f"{i:06d}.bin", name, settings, i) for i in range(len(T))]
+        alone = workers == 1 or len(tasks) <= 8
+        saved = map(_save_scan, tasks) if alone else in_processes(_save_scan, tasks, workers, 8)
+        for _ in progress(saved, len(tasks), f"simulating {name}, scans"):
+            pass
+        (folder / "calib.txt").write_text(calib)
+        (folder / "times.txt").write_text("".join(f"{0.1 * i:.6e}\n" for i in range(len(T))))
+        (folder / "simulated.json").write_text(json.dumps(settings))
+        write_poses(root / "poses" / f"{name}.txt", velo_to_camera(invert(T[0]) @ T, Tr))
 
 
 def simulate(root: str | Path, seed=0, sequences="all", scans=None, azimuth=1800,
@@ -1922,49 +1731,24 @@ def simulate(root: str | Path, seed=0, sequences="all", scans=None, azimuth=1800
     it is. Raises ValueError for arguments out of range, or when ROOT holds such a sequence from
     elsewhere or with other settings, and OSError if a file cannot be written.
     """
-    root = Path(root)
+    root, names = Path(root), expand_splits(sequences)
     for name, value, least in (("seed", seed, 0), ("scans", scans, 1), ("azimuth", azimuth, 16),
                                ("workers", workers, 1)):
         if value is not None and (value != int(value) or value < least):
             raise ValueError(f"{name} is {value} but must be a whole number, {least} or more.")
-    missing = _missing_sequences(root, expand_splits(sequences), seed, scans, azimuth)
-    folders = {name: root / "sequences" / name for name in missing}
-    Tr, calib = _calibration()
-
-    # Each process has temporary folders of its own, so several may fill the same ROOT. The first to
-    # finish a sequence has made it.
-    temporary = {name: temporary_beside(folder) for name, folder in folders.items()
-                 if not folder.exists()}
-    tasks = []
-    for name, folder in temporary.items():
-        for i in range(missing[name]["scans"]):
-            tasks.append((folder / "velodyne" / f"{i:06d}.bin", name, missing[name], i))
-    if (workers or cores()) > 1 and len(tasks) > 8:
-        saved = in_processes(_save_scan, tasks, workers, chunksize=8)
-    else:
-        saved = (_save_scan(task) for task in tasks)
-    try:
-        for folder in temporary.values():
-            shutil.rmtree(folder, ignore_errors=True)  # left by an earlier process with the same id
-            (folder / "velodyne").mkdir(parents=True)
-        made = progress(saved, len(tasks), "simulating")
-        for name, settings in missing.items():
-            T = _world(name, settings["seed"], settings["scans"]).T
-            if name in temporary:
-                for _ in range(len(T)):
-                    next(made)
-                _finish_sequence(temporary[name], folders[name], settings, calib)
-            if (folders[name] / "simulated.json").read_text() != json.dumps(settings):
-                raise ValueError(f"{folders[name]} was made meanwhile, with other settings: choose "
-                                 "another folder.")
-            # The poses come last: without them a sequence is not complete
-            T_cam = velo_to_camera(invert(T[0]) @ T, Tr)
-            write_poses(root / "poses" / f"{name}.txt", T_cam)
-        next(made, None)  # lets the progress line end
-    finally:
-        saved.close()
-        for folder in temporary.values():
-            shutil.rmtree(folder, ignore_errors=True)
+    for name in names:
+        if not isinstance(name, str) or name in ("", ".", "..") or re.search(r"[/\\\0]", name):
+            raise ValueError(f"The sequence name {name!r} is no plain folder name: use one such "
+                             "as '00'.")
+    settings = {name: {"city": CITY, "seed": int(seed), "scans": int(scans or default_scans(name)),
+                       "azimuth": int(azimuth)} for name in names}
+    missing = [name for name in names if not _is_complete(root, name, settings[name])]
+    for name in missing:
+        try:
+            _simulate_sequence(root, name, settings[name], workers or cores())
+        except OSError:
+            if not _is_complete(root, name, settings[name]):  # no other process was faster
+                raise
     return root
 
 

@@ -10,16 +10,17 @@ percent, E_r in degrees per metre.
 """
 import argparse
 import codecs
-import glob
 import json
 import os
-import platform
-import shutil
+import secrets
 import sys
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+
+# ------------------------------------------------------------------------------------------------
+# Errors
 
 LENGTHS = np.arange(100, 801, 100)  # length of a segment [m]; devkit: lengths[]
 START_EVERY = 10  # frames between the starts of two segments, one second; devkit: step_size
@@ -30,158 +31,21 @@ SEGMENT = np.dtype([
     ("t_err", float),  # translation error [%]
     ("r_err", float),  # rotation error [deg/m]
 ])
-HEADER = ["sequence", "segments", "E_t [%]", "E_r [deg/m]", "t step [m]", "r step [deg]"]
-UNITS = """\
-E_t, E_r: KITTI devkit, mean over segments of 100 to 800 m of path. t step, r step: mean error per
-step. ATE, RPE: RMSE without alignment, RPE over one frame, as `evo_ape kitti` and `evo_rpe kitti`
-print by default; for RPE [deg] give evo_rpe -r angle_deg.
-All in the frame of the files; KITTI's is the rectified left camera."""
-
-# ------------------------------------------------------------------------------------------------
-# Files
-
-
-def temporary_beside(path):
-    """A temporary path beside `path`, named after this machine and process.
-
-    Deletes leftovers of dead local processes.
-    """
-    prefix = f".{path.name}.{platform.node()}."
-    if os.name == "posix":  # on Windows, os.kill(process, 0) would send Ctrl-C
-        for leftover in path.parent.glob(glob.escape(prefix) + "*"):
-            if not _is_dead(leftover.name[len(prefix):]):
-                continue
-            if leftover.is_dir():
-                shutil.rmtree(leftover, ignore_errors=True)
-            else:
-                leftover.unlink(missing_ok=True)
-    return path.with_name(prefix + str(os.getpid()))
-
-
-def _is_dead(process):
-    """Whether no local process has the id `process`, a string. False if it is not a number."""
-    try:
-        os.kill(int(process), 0)  # signal 0 only tests whether the process exists
-    except (ProcessLookupError, OverflowError):  # no such process; no possible id
-        return True
-    except (PermissionError, ValueError):  # a process of another user; not a number
-        return False
-    return False
-
-
-@contextmanager
-def add_path_to_oserror(path):
-    """Add the file name to an OSError of the block that has none, such as for a full disk."""
-    try:
-        yield
-    except OSError as error:
-        if error.filename is None and error.strerror:
-            raise OSError(error.errno, error.strerror, str(path)) from None
-        raise
-
-
-@contextmanager
-def replacing(path):
-    """Yield a temporary path beside `path`, and move it to `path` if the block succeeds.
-
-    So `path` never holds a half-written file. Raises OSError, naming the file, if writing fails or
-    if `path` is not a regular file.
-    """
-    path = Path(path)
-    if path.exists() and not path.is_file():
-        raise OSError(f"{path}: is not a regular file, so it is not replaced; choose another name")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = temporary_beside(path)
-    try:
-        with add_path_to_oserror(path):
-            yield temporary
-            os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def write_json(path, content):
-    """Write lists, dicts and numbers as JSON, through a temporary file.
-
-    NaN and infinity become null, since JSON has neither.
-    """
-    text = json.dumps(content)
-    content = json.loads(text, parse_constant=lambda constant: None)  # NaN, Infinity, -Infinity
-    text = json.dumps(content, indent=1, allow_nan=False)
-    with replacing(path) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
-
-
-def read_poses(path: str | Path) -> np.ndarray:
-    """Read a KITTI pose file.
-
-    A line holds 12 numbers, the top three rows of a pose; blank lines are skipped. Returns (n,4,4)
-    float64, translations in metres. Raises FileNotFoundError if there is no such file, and
-    ValueError if it holds no pose, or a line that is not 12 finite numbers or not a rigid motion.
-    """
-    text = Path(path).read_bytes().removeprefix(codecs.BOM_UTF8)
-    if text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        raise ValueError(f"{path}: is UTF-16 text; save it as UTF-8")
-    lines = enumerate(text.splitlines(), 1)
-    rows = [(number, line.split()) for number, line in lines if line.strip()]
-    if not rows:
-        raise ValueError(f"{path}: holds no pose; give a KITTI pose file, 12 numbers a line")
-
-    T = np.tile(np.eye(4), (len(rows), 1, 1))  # (n,4,4)
-    for pose, (number, words) in zip(T, rows):
-        try:
-            pose[:3] = np.array(words, float).reshape(3, 4)
-        except ValueError:
-            pose[:] = np.nan
-        if not np.isfinite(pose).all():
-            raise ValueError(f"{path}, line {number}: {len(words)} words, but a KITTI pose is 12 "
-                             "finite numbers; correct the line")
-
-    rigid = is_rigid(T)
-    if not rigid.all():
-        raise ValueError(f"{path}: pose {np.argmin(rigid)} (counted from 0) is not a rigid motion; "
-                         "its left 3x3 block must be a rotation")
-    return T
-
-
-def is_rigid(T):
-    """Whether matrices T (...,3,4) or (...,4,4) are finite and hold a rotation -> (...) bool."""
-    R = T[..., :3, :3]
-    with np.errstate(all="ignore"):  # huge numbers overflow
-        deviation = np.abs(R @ R.swapaxes(-1, -2) - np.eye(3)).max((-1, -2))
-        is_rotation = (deviation < 1e-2) & (np.linalg.det(R) > 0)
-    return np.isfinite(T).all((-1, -2)) & is_rotation
-
-
-def write_poses(path: str | Path, T: np.ndarray) -> None:
-    """Write poses (n,4,4) as a KITTI pose file.
-
-    Raises ValueError for another shape, and OSError if the file cannot be written.
-    """
-    if np.ndim(T) != 3 or np.shape(T)[1:] != (4, 4):
-        raise ValueError(f"poses have the shape (n, 4, 4), not {np.shape(T)}")
-    rows = np.asarray(T)[:, :3].reshape(-1, 12)
-    with replacing(path) as temporary, open(temporary, "w", newline="\n") as file:
-        np.savetxt(file, rows, fmt="%.9e")
-
-
-# ------------------------------------------------------------------------------------------------
-# Errors
-
-
-def _check_shapes(T_gt, T_est):
-    """Return both trajectories as float64 arrays. Raises ValueError if their shapes differ."""
-    T_gt, T_est = np.asarray(T_gt, float), np.asarray(T_est, float)
-    if T_gt.shape != T_est.shape:
-        raise ValueError(f"true poses {T_gt.shape}, but estimated poses {T_est.shape}; both must "
-                         "be (n,4,4) and cover the same scans")
-    return T_gt, T_est
 
 
 def path_lengths(T):
     """Poses (n,4,4) -> length of the path up to each pose (n,) [m]; devkit: trajectoryDistances."""
     steps = np.diff(T[:, :3, 3], axis=0)  # (n-1,3)
     return np.concatenate([[0], np.cumsum(np.linalg.norm(steps, axis=1))])
+
+
+def _same_shape(T_gt, T_est):
+    """Both trajectories as float64 arrays. Raises ValueError if their shapes differ."""
+    T_gt, T_est = np.asarray(T_gt, float), np.asarray(T_est, float)
+    if T_gt.shape != T_est.shape:
+        raise ValueError(f"true poses {T_gt.shape}, but estimated poses {T_est.shape}; both must "
+                         "be (n,4,4) and cover the same scans")
+    return T_gt, T_est
 
 
 def segment_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
@@ -196,13 +60,12 @@ def segment_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
     and not by the straight distance of eqs. 7 and 8. The devkit sums the path in float32, which can
     shift `last` by one frame; here it is float64. Raises ValueError if the shapes differ.
     """
-    T_gt, T_est = _check_shapes(T_gt, T_est)
+    T_gt, T_est = _same_shape(T_gt, T_est)
     path = path_lengths(T_gt)  # (n,)
 
     # Every length from every start
     starts = np.arange(0, len(path), START_EVERY)
-    first = np.repeat(starts, len(LENGTHS))  # (starts*lengths,)
-    length = np.tile(LENGTHS, len(starts))  # (starts*lengths,)
+    first, length = np.repeat(starts, len(LENGTHS)), np.tile(LENGTHS, len(starts))
 
     # The first frame beyond that length; drop segments that go beyond the end of the drive
     last = np.searchsorted(path, path[first] + length, side="right")
@@ -242,7 +105,7 @@ def step_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
     True and estimated poses (n,4,4) -> (n-1,2): translation [m] and rotation angle [deg] of
     inv(motion_est) @ motion_gt, in the frame of the poses. Raises ValueError if the shapes differ.
     """
-    T_gt, T_est = _check_shapes(T_gt, T_est)
+    T_gt, T_est = _same_shape(T_gt, T_est)
     motion_gt = np.linalg.inv(T_gt[:-1]) @ T_gt[1:]  # (n-1,4,4)
     motion_est = np.linalg.inv(T_est[:-1]) @ T_est[1:]  # (n-1,4,4)
     error = np.linalg.inv(motion_est) @ motion_gt  # (n-1,4,4)
@@ -257,40 +120,32 @@ def step_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
     return np.stack([distance, angle], axis=1)
 
 
-def absolute_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
-    """Distances between true and estimated positions, without any alignment.
-
-    True and estimated poses (n,4,4) -> (n,) [m]. Raises ValueError if the shapes differ.
-    """
-    T_gt, T_est = _check_shapes(T_gt, T_est)
-    return np.linalg.norm(T_gt[:, :3, 3] - T_est[:, :3, 3], axis=1)
-
-
 def rmse(errors):
-    """Root mean square of errors (n,), evo's rmse. NaN if there are none."""
+    """Root mean square of errors (n,), as evo computes it. NaN if there are none."""
     return float(np.sqrt(np.mean(np.square(errors)))) if len(errors) else float("nan")
+
+
+def absolute_error(T_gt: np.ndarray, T_est: np.ndarray) -> float:
+    """ATE [m]: RMSE of the positions, without any alignment. Two trajectories (n,4,4).
+
+    Raises ValueError if the shapes differ.
+    """
+    T_gt, T_est = _same_shape(T_gt, T_est)
+    return rmse(np.linalg.norm(T_gt[:, :3, 3] - T_est[:, :3, 3], axis=1))
 
 
 # ------------------------------------------------------------------------------------------------
 # Tables
 
-
-def table(header, rows):
-    """Format a header and rows as lines of text. NaN becomes "-".
-
-    The first column is aligned to the left, all others to the right.
-    """
-    cells = [list(header)]
-    for row in rows:
-        texts = [str(cell) for cell in row]
-        cells.append(["-" if text.strip() == "nan" else text for text in texts])
-    widths = [max(map(len, column)) for column in zip(*cells)]
-    lines = []
-    for name, *figures in cells:
-        aligned = [name.ljust(widths[0])]
-        aligned += [figure.rjust(width) for figure, width in zip(figures, widths[1:])]
-        lines.append("  ".join(aligned))
-    return "\n".join(lines)
+COLUMNS = {  # key of a summary: header, digits after the point
+    "segments": ("segments", 0), "E_t": ("E_t [%]", 3), "E_r": ("E_r [deg/m]", 5),
+    "t_step_m": ("t step [m]", 4), "r_step_deg": ("r step [deg]", 4),
+    "ate_m": ("ATE [m]", 3), "rpe_m": ("RPE [m]", 4), "rpe_deg": ("RPE [deg]", 4)}
+UNITS = """\
+E_t, E_r: KITTI devkit, mean over segments of 100 to 800 m of path. t step, r step: mean error per
+step. ATE, RPE: RMSE without alignment, RPE over one frame, as `evo_ape kitti` and `evo_rpe kitti`
+print by default; for RPE [deg] give evo_rpe -r angle_deg.
+All in the frame of the files; KITTI's is the rectified left camera."""
 
 
 def summary(segments, steps):
@@ -308,22 +163,123 @@ def summary(segments, steps):
 def by_length(segments):
     """A list of `segment_errors` -> {"100 m": summary, ...} for the lengths that occur."""
     pooled = np.concatenate([np.empty(0, SEGMENT), *segments])
-    summaries = {}
-    for length in LENGTHS:
-        of_length = pooled[pooled["length"] == length]
-        if len(of_length):
-            summaries[f"{length} m"] = summary([of_length], [])
-    return summaries
+    return {f"{length} m": summary([pooled[pooled["length"] == length]], [])
+            for length in LENGTHS if length in pooled["length"]}
 
 
-def row(name, s):
-    """Format a `summary` as a row of a table with the columns of HEADER."""
-    return [name, s["segments"], f"{s['E_t']:.3f}", f"{s['E_r']:.5f}", f"{s['t_step_m']:.4f}",
-            f"{s['r_step_deg']:.4f}"]
+def table(rows):
+    """Format a list of (name, summary) as text. A figure that is missing or NaN becomes "-"."""
+    keys = [key for key in COLUMNS if any(key in s for _, s in rows)]
+    lines = [["sequence", *(COLUMNS[key][0] for key in keys)]]
+    for name, s in rows:
+        figures = [f"{s.get(key, float('nan')):.{COLUMNS[key][1]}f}" for key in keys]
+        lines.append([name, *("-" if figure == "nan" else figure for figure in figures)])
+    widths = [max(map(len, column)) for column in zip(*lines)]
+    return "\n".join("  ".join([name.ljust(widths[0]), *map(str.rjust, figures, widths[1:])])
+                     for name, *figures in lines)
+
+
+# ------------------------------------------------------------------------------------------------
+# Files
+
+
+@contextmanager
+def replacing(path):
+    """Yield a temporary path beside `path`, and move it to `path` if the block succeeds.
+
+    So `path` never holds a half-written file. Raises OSError, naming the file, if writing fails or
+    if `path` is not a regular file.
+    """
+    path = Path(path)
+    if path.exists() and not path.is_file():
+        raise OSError(f"{path}: is not a regular file, so it is not replaced; choose another name")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        if error.filename is None and error.strerror:  # such as for a full disk
+            raise OSError(error.errno, error.strerror, str(path)) from None
+        raise
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_json(path, content):
+    """Write lists, dicts and numbers as JSON, through a temporary file.
+
+    NaN and infinity become null, since JSON has neither.
+    """
+    content = json.loads(json.dumps(content), parse_constant=lambda constant: None)
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1) + "\n", "utf-8", newline="\n")
+
+
+def read_lines(path):
+    """Read a text file: [(number, words), ...] of its lines, without the blank ones.
+
+    A UTF-8 mark at the start is skipped. Raises OSError if the file cannot be read, and ValueError
+    for UTF-16.
+    """
+    text = Path(path).read_bytes().removeprefix(codecs.BOM_UTF8)
+    if text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise ValueError(f"{path}: is UTF-16 text; save it as UTF-8")
+    lines = enumerate(text.decode("utf-8", "replace").splitlines(), 1)
+    return [(number, line.split()) for number, line in lines if line.strip()]
+
+
+def read_poses(path: str | Path) -> np.ndarray:
+    """Read a KITTI pose file.
+
+    A line holds 12 numbers, the top three rows of a pose; blank lines are skipped. Returns (n,4,4)
+    float64, translations in metres. Raises FileNotFoundError if there is no such file, and
+    ValueError if it holds no pose, or a line that is not 12 finite numbers or not a rigid motion.
+    """
+    lines = read_lines(path)
+    if not lines:
+        raise ValueError(f"{path}: holds no pose; give a KITTI pose file, 12 numbers a line")
+    T = np.tile(np.eye(4), (len(lines), 1, 1))  # (n,4,4)
+    for pose, (number, words) in zip(T, lines):
+        try:
+            pose[:3] = np.array(words, float).reshape(3, 4)
+        except ValueError:
+            pose[:] = np.nan
+        if not np.isfinite(pose).all():
+            raise ValueError(f"{path}, line {number}: {len(words)} words, but a KITTI pose is 12 "
+                             "finite numbers; correct the line")
+    rigid = is_rigid(T)
+    if not rigid.all():
+        raise ValueError(f"{path}: pose {np.argmin(rigid)} (counted from 0) is not a rigid motion; "
+                         "its left 3x3 block must be a rotation")
+    return T
+
+
+def is_rigid(T):
+    """Whether matrices T (...,3,4) or (...,4,4) are finite and hold a rotation -> (...) bool."""
+    R = T[..., :3, :3]
+    with np.errstate(all="ignore"):  # huge numbers overflow
+        deviation = np.abs(R @ R.swapaxes(-1, -2) - np.eye(3)).max((-1, -2))
+        is_rotation = (deviation < 1e-2) & (np.linalg.det(R) > 0)
+    return np.isfinite(T).all((-1, -2)) & is_rotation
+
+
+def write_poses(path: str | Path, T: np.ndarray) -> None:
+    """Write poses (n,4,4) as a KITTI pose file, through a temporary file.
+
+    Raises ValueError for another shape, and OSError if the file cannot be written.
+    """
+    if np.ndim(T) != 3 or np.shape(T)[1:] != (4, 4):
+        raise ValueError(f"poses have the shape (n, 4, 4), not {np.shape(T)}")
+    rows = np.asarray(T)[:, :3].reshape(-1, 12)
+    with replacing(path) as temporary, open(temporary, "w", newline="\n") as file:
+        np.savetxt(file, rows, fmt="%.9e")
 
 
 # ------------------------------------------------------------------------------------------------
 # Pictures
+
+PICTURES = ".png", ".pdf", ".svg"
 
 
 def new_figure(width, height):
@@ -351,7 +307,7 @@ def view_from_above(T: np.ndarray) -> tuple[np.ndarray, str, str]:
 
 
 def draw(path, trajectories):
-    """Draw trajectories into a PNG file.
+    """Draw trajectories into a file, of a format in PICTURES.
 
     trajectories: {name: (T_gt or None, T_est)}, poses (n,4,4) in a camera's or a LiDAR's frame.
     Each name is a row: the path from above and, if there is any ground truth, KITTI's errors by
@@ -362,38 +318,27 @@ def draw(path, trajectories):
     figure = new_figure(3.5 * columns, 3.1 * len(trajectories))
     rows = figure.subplots(len(trajectories), columns, squeeze=False)
     for (name, (T_gt, T_est)), (above, *errors) in zip(trajectories.items(), rows):
-        _draw_paths(above, name, T_gt, T_est)
+        view, right, forward = view_from_above(T_est if T_gt is None else T_gt)
+        if T_gt is not None:
+            above.plot(*view @ T_gt[:, :3, 3].T, color="0.65", lw=4, label="truth")
+        above.plot(*view @ T_est[:, :3, 3].T, color="black", lw=1.2, label="estimate")
+        above.plot(0, 0, "ko", ms=5)
+        above.set(title=f"{name} from above, from the dot", xlabel=right, ylabel=forward,
+                  aspect="equal", adjustable="datalim")
+        above.legend(frameon=False)
         lengths = by_length([] if T_gt is None else [segment_errors(T_gt, T_est)])
-        for axis, error, unit in zip(errors, ("E_t", "E_r"), ("%", "deg/m")):
-            _draw_errors(axis, name, error, unit, lengths)
+        for axis, key, unit in zip(errors, ("E_t", "E_r"), ("%", "deg/m")):
+            values = [s[key] for s in lengths.values()]
+            axis.plot([int(length.split()[0]) for length in lengths], values, "ko-")
+            if not lengths:
+                axis.text(450, 0.5, "no segment", ha="center")
+            axis.set(title=f"{name}: {key} by length", xlabel="length of the segments [m]",
+                     ylabel=f"{key} [{unit}]", xlim=(50, 850),
+                     ylim=(0, 1.15 * max(values, default=0) or 1))
     for axis in rows.flat:
         axis.grid(color="0.9")
     with replacing(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=100)
-
-
-def _draw_paths(axis, name, T_gt, T_est):
-    """Draw the true path, if there is one, and the estimated path from above."""
-    view, right, forward = view_from_above(T_est if T_gt is None else T_gt)
-    if T_gt is not None:
-        axis.plot(*view @ T_gt[:, :3, 3].T, color="0.65", lw=4, label="truth")
-    axis.plot(*view @ T_est[:, :3, 3].T, color="black", lw=1.2, label="estimate")
-    axis.plot(0, 0, "ko", ms=5)
-    axis.set(title=f"{name} from above, from the dot", xlabel=right, ylabel=forward,
-             aspect="equal", adjustable="datalim")
-    axis.legend(frameon=False)
-
-
-def _draw_errors(axis, name, error, unit, lengths):
-    """Draw an error, "E_t" or "E_r", of the summaries that `by_length` returns."""
-    metres = [int(length.split()[0]) for length in lengths]
-    values = [s[error] for s in lengths.values()]
-    axis.plot(metres, values, "ko-")
-    if not lengths:
-        axis.text(450, 0.5, "no segment", ha="center")
-    top = 1.15 * max(values, default=0) or 1
-    axis.set(title=f"{name}: {error} by length", xlabel="length of the segments [m]",
-             ylabel=f"{error} [{unit}]", xlim=(50, 850), ylim=(0, top))
+        figure.savefig(temporary, format=Path(path).suffix[1:], dpi=100)
 
 
 # ------------------------------------------------------------------------------------------------
@@ -407,48 +352,38 @@ def _pairs_of_files(gt, est):
                          "files, or two folders of NN.txt")
     if not gt.is_dir():
         return {gt.stem: (gt, est)}
-    pairs = {}
-    for path in sorted(est.glob("*.txt")):
-        if (gt / path.name).is_file():
-            pairs[path.stem] = gt / path.name, path
+    pairs = {path.stem: (gt / path.name, path) for path in sorted(est.glob("[!.]*.txt"))
+             if (gt / path.name).is_file()}
     if not pairs:
         raise FileNotFoundError(f"{est}: holds no NN.txt that is also in {gt}; give two folders "
                                 "with pose files of the same names")
     return pairs
 
 
-def _check_picture(png, pairs):
-    """Raise ValueError if the picture would replace one of the pose files."""
-    inputs = [path for pair in pairs.values() for path in pair]
-    if png.exists() and any(path.exists() and png.samefile(path) for path in inputs):
-        raise ValueError(f"--plot {png}: is one of the pose files; choose another name")
-
-
-def _read_pair(gt, est):
-    """Read true and estimated poses (n,4,4). Raises ValueError if their numbers differ."""
-    T_gt, T_est = read_poses(gt), read_poses(est)
-    if len(T_gt) != len(T_est):
-        raise ValueError(f"{est}: {len(T_est)} poses, but {gt} has {len(T_gt)}; both must cover "
-                         "the same scans")
-    return T_gt, T_est
-
-
-def _report(trajectories):
-    """Format the errors of {name: (T_gt, T_est)} as a table."""
-    rows, segments, steps = [], [], []
-    for name, (T_gt, T_est) in trajectories.items():
+def _compare(gt, est, picture=None):
+    """Compare pose files or folders. Returns the text to print; draws the picture, if any."""
+    pairs = _pairs_of_files(gt, est)
+    if picture and (picture.suffix not in PICTURES
+                    or picture.resolve() in [path.resolve() for pair in pairs.values()
+                                             for path in pair]):
+        raise ValueError(f"--plot {picture}: give the name of a new {', '.join(PICTURES)} file")
+    trajectories, segments, steps, rows = {}, [], [], []
+    for name, (gt, est) in pairs.items():
+        T_gt, T_est = trajectories[name] = read_poses(gt), read_poses(est)
+        if len(T_gt) != len(T_est):
+            raise ValueError(f"{est}: {len(T_est)} poses, but {gt} has {len(T_gt)}; both must "
+                             "cover the same scans")
         segments.append(segment_errors(T_gt, T_est))
         steps.append(step_errors(T_gt, T_est))
-        ate = rmse(absolute_errors(T_gt, T_est))
-        rpe_m, rpe_deg = rmse(steps[-1][:, 0]), rmse(steps[-1][:, 1])
-        errors = row(name, summary(segments[-1:], steps[-1:]))
-        rows.append([*errors, f"{ate:.3f}", f"{rpe_m:.4f}", f"{rpe_deg:.4f}"])
-    blank = ["-", "-", "-"]
+        evo = {"ate_m": absolute_error(T_gt, T_est), "rpe_m": rmse(steps[-1][:, 0]),
+               "rpe_deg": rmse(steps[-1][:, 1])}
+        rows.append((name, summary(segments[-1:], steps[-1:]) | evo))
     if len(rows) > 1:
-        rows.append(row("all", summary(segments, steps)) + blank)
-    for length, s in by_length(segments).items():
-        rows.append(row(length, s) + blank)
-    return table([*HEADER, "ATE [m]", "RPE [m]", "RPE [deg]"], rows)
+        rows.append(("all", summary(segments, steps)))
+    rows += by_length(segments).items()
+    if picture:
+        draw(picture, trajectories)
+    return "\n".join([table(rows), UNITS, *([str(picture)] if picture else [])])
 
 
 def main(argv=None):
@@ -459,23 +394,15 @@ def main(argv=None):
         "ground truth: a pose file, or a folder of NN.txt"))
     parser.add_argument("est", metavar="EST", type=Path, help=(
         "estimate: a pose file, or a folder of NN.txt"))
-    parser.add_argument("--plot", metavar="PNG", type=Path, help=(
-        "draw the paths and the errors by segment length; needs matplotlib"))
+    parser.add_argument("--plot", metavar="FILE", type=Path, help=(
+        "draw the paths and the errors by segment length into a .png, .pdf or .svg file; "
+        "needs matplotlib"))
     args = parser.parse_args(argv)
     try:
-        pairs = _pairs_of_files(args.gt, args.est)
-        if args.plot:
-            _check_picture(args.plot, pairs)
-        trajectories = {name: _read_pair(gt, est) for name, (gt, est) in pairs.items()}
-        if args.plot:
-            draw(args.plot, trajectories)
+        print(_compare(args.gt, args.est, args.plot))
     except (ValueError, OSError) as error:
         print(f"metrics.py: {error}", file=sys.stderr)
         return 2
-    lines = [_report(trajectories), UNITS]
-    if args.plot:
-        lines.append(str(args.plot))
-    print("\n".join(lines))
     return 0
 
 
