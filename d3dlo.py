@@ -3,19 +3,14 @@
 The network takes two consecutive LiDAR scans P and Q and predicts the rigid motion between them.
 Read this file beside the paper, from top to bottom:
 
-    1  Configuration            Table 1 and section 4
-    2  Sampling and grouping    sections 3.3.2 and 3.3.3; NumPy, as nothing is learned here
-    3  The network              section 3.3, eqs. 3 and 4, Fig. 1; PyTorch
-    4  Training                 eq. 2 and section 4
-    5  Odometry                 eq. 1
-    6  Our additions            not in the paper: augmentation and refinement
-    7  Evaluation               section 5
-    8  The commands train and eval
+    1  Table 1 and the settings            5  Odometry: eq. 1
+    2  Sampling and grouping: 3.3.2, 3.3.3 6  Our additions: augmentation and refinement
+    3  The network: 3.3, eqs. 3 and 4      7  Evaluation: section 5
+    4  Training: eq. 2, section 4          8  The commands train and eval
 
-kitti.py converts motions to the vectors of section 3.2 (`to_vector`), removes the ground plane
-(section 4), and loads or simulates the data. metrics.py computes E_t and E_r, eqs. 6 to 8. What
-the paper tried and rejected (eq. 5, quaternions, uncertainty weighting, multi-scale grouping) is
-in benchmarks/experiments.py. docs/paper-differences.md lists the differences from the paper.
+kitti.py loads or simulates the data, removes the ground plane (section 4) and converts motions to
+the vectors of section 3.2. metrics.py computes E_t and E_r, eqs. 6 to 8. What the paper tried and
+rejected is in benchmarks/experiments.py. docs/paper-differences.md lists where we differ from it.
 
 Frame: Velodyne, x forward, y left, z up, in metres. T_ab maps points from frame b to frame a;
 T_pq is the paper's T_{t,t+1}. Shapes: N points of a scan, S centroids, k neighbours, c features,
@@ -60,7 +55,7 @@ from kitti import SPLITS, from_vector, invert, progress, to_vector
 __version__ = "0.3.0"
 
 # ------------------------------------------------------------------------------------------------
-# 1  Configuration: Table 1 and section 4
+# 1  Table 1 and the settings of section 4
 
 
 class Layer(NamedTuple):
@@ -103,45 +98,43 @@ class Config:
         for name in ("sa1", "fe", "sa2", "sa3", "mpn", "mlp"):
             *numbers, widths = getattr(self, name)
             object.__setattr__(self, name, Layer(*numbers, tuple(widths)))
-        for setting, sound in self.checks():
-            if not sound:
-                raise ValueError(f"Config: {setting}")
-
-    def checks(self):
-        """Yield what each setting must be, and whether it is."""
-        def whole(x, most=2**31):
-            return type(x) is int and 1 <= x <= most
-
-        def positive(x):
-            return type(x) in (int, float) and 0 < x < math.inf
-
-        sa, layers = (self.sa1, self.sa2, self.sa3), (self.sa1, self.fe, self.sa2, self.sa3)
-        widths = [layer.widths for layer in (*layers, self.mpn, self.mlp)]
-        yield "every radius must be positive", all(positive(x.r) for x in sa)
-        yield "n_fps must be 1 to 65,535", all(whole(x.n_fps, 65535) for x in sa)
-        yield ("n_fps must not increase from layer to layer",
-               sa[0].n_fps >= sa[1].n_fps >= sa[2].n_fps)
-        yield "n_n must be 1 to 1,024", all(whole(x.n_n, 1024) for x in layers)
-        yield "an MLP needs 2 to 16 layers", all(2 <= len(w) <= 16 for w in widths)
-        yield "widths must be 1 to 1,024", all(whole(x, 1024) for w in widths for x in w)
-        yield "the last width of mlp must be 6: translation and angles", self.mlp.widths[-1] == 6
-        yield "max_range must be positive", self.max_range is None or positive(self.max_range)
-        yield "plane and augment must be True or False", {self.plane, self.augment} <= {True, False}
-        yield "epochs and batch must be 1 or more", whole(self.epochs) and whole(self.batch)
-        yield "lr must be positive", positive(self.lr)
-        yield "frozen must be at least 0 and below 1", (
-            self.frozen == 0 or positive(self.frozen) and self.frozen < 1)
-        yield "optimizer must be adam or muon", self.optimizer in ("adam", "muon")
-        yield "schedule must be steps or one-cycle", self.schedule in ("steps", "one-cycle")
-        yield "swap must be both or random", self.swap in ("both", "random")
+        check_config(self)
 
     def as_dict(self):
         """A dict that JSON can hold. `Config(**d)` is the inverse."""
         return json.loads(json.dumps(asdict(self)))
 
 
-# The settings of training, as opposed to those of the network and its input
-TRAINING = "epochs", "batch", "optimizer", "lr", "schedule", "swap", "augment", "frozen"
+def check_config(config):
+    """Raise a ValueError that names the invalid setting."""
+    def require(name, values, low, high):
+        for x in values:  # integers only, if the bounds are integers
+            if isinstance(x, bool) or not isinstance(x, (int, type(low))) or not low <= x <= high:
+                raise ValueError(f"Config: {name} is {x!r}, but must be {low} to {high}")
+
+    sa = [config.sa1, config.sa2, config.sa3]
+    grouping = [*sa, config.fe]
+    widths = [layer.widths for layer in (*grouping, config.mpn, config.mlp)]
+    require("r", [layer.r for layer in sa], 1e-3, 1e3)
+    require("n_fps", [layer.n_fps for layer in sa], 1, 65535)
+    require("n_fps of sa2", [config.sa2.n_fps], 1, config.sa1.n_fps)
+    require("n_fps of sa3", [config.sa3.n_fps], 1, config.sa2.n_fps)
+    require("n_n", [layer.n_n for layer in grouping], 1, 1024)
+    require("number of widths", map(len, widths), 2, 16)
+    require("width", itertools.chain(*widths), 1, 1024)
+    require("last width of mlp", config.mlp.widths[-1:], 6, 6)
+    require("max_range", [] if config.max_range is None else [config.max_range], 1e-3, 1e3)
+    require("epochs", [config.epochs], 1, 10**9)
+    require("batch", [config.batch], 1, 10**6)
+    require("lr", [config.lr], 1e-12, 1e3)
+    require("frozen", [config.frozen], 0.0, 0.999)
+    for name, choices in dict(plane=(True, False), augment=(True, False), swap=("random", "both"),
+                              optimizer=("adam", "muon"), schedule=("steps", "one-cycle")).items():
+        if getattr(config, name) not in choices:
+            raise ValueError(f"Config: {name} is {getattr(config, name)!r}, but must be "
+                             f"{choices[0]} or {choices[1]}")
+
+
 # Our short recipe: a quarter of an hour on the simulated city
 SHORT = dict(max_range=50.0, epochs=9, batch=8, optimizer="muon", lr=1e-2, schedule="one-cycle",
              swap="both", augment=True, frozen=0.25)
@@ -154,12 +147,12 @@ def farthest_point_sampling(xyz: np.ndarray, n: int) -> np.ndarray:
     """Farthest point sampling: each new centroid is the point farthest from all centroids so far.
 
     xyz (N,3), finite -> indices (n,) int64 of the centroids, the first of them 0. Ties go to the
-    first in order of x. The result is exact and nested: its first m indices are the result for
-    n = m. Raises ValueError unless 0 < n <= N.
+    first in order of x. Exact and nested: the first m indices are the result for n = m. Raises
+    ValueError unless 0 < n <= N.
 
     The trick: let r be the distance of the new centroid from the nearest earlier one. No point is
-    farther than r from them. So the new centroid is only nearer to points less than r away. With
-    the points sorted by x, these are in a short slice.
+    farther from all earlier ones, so only points closer than r to the new one are affected. Sorted
+    by x, they lie in a slice.
     """
     if not 0 < n <= len(xyz):
         raise ValueError(f"cannot sample {n} of {len(xyz)} points")
@@ -173,9 +166,11 @@ def farthest_point_sampling(xyz: np.ndarray, n: int) -> np.ndarray:
         p, r = points[:, j], np.nextafter(np.sqrt(min_dist[j]), np.inf)  # rounded up
         near = slice(points[0].searchsorted(p[0] - r, "left"),
                      points[0].searchsorted(p[0] + r, "right"))
-        d = points[:, near] - p[:, None]
+        d = points[:, near] - p[:, None]  # (3,points near)
         d *= d
-        np.minimum(min_dist[near], d[0] + d[1] + d[2], out=min_dist[near])
+        d[0] += d[1]
+        d[0] += d[2]
+        np.minimum(min_dist[near], d[0], out=min_dist[near])
         j = min_dist.argmax()
     return centroids
 
@@ -183,11 +178,10 @@ def farthest_point_sampling(xyz: np.ndarray, n: int) -> np.ndarray:
 def group_ball(xyz: np.ndarray, centroids: np.ndarray, r: float, n_n: int, tree=None) -> np.ndarray:
     """The neighbours i of each centroid j in eq. 3: the nearest n_n points with |x_i - x'_j| <= r.
 
-    xyz (N,3) in metres, centroids (S,) indices into xyz -> (S,n_n) indices, nearest first (the
-    paper does not say which n_n points it takes). The first one is the centroid itself, or a point
-    at the same place, so no ball is empty. Missing neighbours are filled with the centroid. These
-    copies leave the maximum in eq. 3 unchanged but do affect the statistics of batch normalisation.
-    tree: a cKDTree of xyz. None builds one.
+    xyz (N,3) in metres, centroids (S,) indices into xyz -> (S,n_n) indices, nearest first. The
+    first one is the centroid itself, or a point at the same place, so no ball is empty. The
+    centroid also fills the places of missing neighbours. These copies leave the maximum in eq. 3
+    unchanged but do affect the statistics of batch normalisation. tree: cKDTree(xyz), if known.
     """
     ranks = [*range(1, n_n + 1)]  # a list keeps the result two-dimensional for n_n = 1
     inclusive = np.nextafter(r, np.inf)  # scipy's bound is exclusive
@@ -215,7 +209,7 @@ def record_dtype(config):
         ("idx_sa3", "u2", (n3, config.sa3.n_n)),  # SA3's neighbours, indices into SA2's centroids
         ("stats", "f4", len(kitti.STATS)),  # scan statistics, to warn about domain shift
         ("invalid", "i4"),  # number of invalid points that were dropped
-        ("crc", "u4"),  # CRC-32 of the scan; 0 unless it was read by `record_of_file`
+        ("crc", "u4"),  # CRC-32 of the scan, filled in by `record_of_file`
     ])
 
 
@@ -224,12 +218,8 @@ def scan_records(scan: np.ndarray, config: Config = Config(), n: int = 1) -> np.
 
     scan: x, y, z [m] in the Velodyne frame, and intensity 0 to 1. Nothing is learned here, so a
     record is computed once for every scan and kept. Refinement uses n > 1: record k takes its
-    centroids from points k, k + n, k + 2n ..., so no two share a centroid; if the points are too
-    few for that, some records are the same. Raises ValueError if too few points are usable.
-
-    One sampling serves all layers. Farthest point sampling of SA1's centroids, from the first one,
-    would choose them in the same order again. So SA2's centroids are the first n2 of them, and
-    SA3's the first n3.
+    centroids from points k, k + n, k + 2n ..., so no two share a centroid; with too few points for
+    that, some records are equal. Raises ValueError if too few points are usable.
     """
     scan, invalid = kitti.usable_points(scan, config.max_range, config.plane)
     sa1, sa2, sa3 = config.sa1, config.sa2, config.sa3
@@ -240,29 +230,26 @@ def scan_records(scan: np.ndarray, config: Config = Config(), n: int = 1) -> np.
                          f"{sa1.n_fps}; are the coordinates in metres?")
     cloud = np.ascontiguousarray(scan[:, :3])
     tree = cKDTree(cloud, leafsize=48, balanced_tree=False, compact_nodes=False)  # fast to build
-    first_n2, first_n3 = np.arange(sa2.n_fps), np.arange(sa3.n_fps)
     parts = min(n, len(cloud) // sa1.n_fps)
     records = np.zeros(n, record_dtype(config))
-    for k in range(n):
+    for k, record in enumerate(records):
         part = k % parts
         centroids = part + parts * farthest_point_sampling(cloud[part::parts], sa1.n_fps)  # (n1,)
         neighbours = group_ball(cloud, centroids, sa1.r, sa1.n_n, tree)  # (n1,k1)
-        xyz = cloud[centroids]  # (n1,3)
-        records["xyz"][k] = xyz
-        records["group_sa1"][k, ..., 0] = scan[neighbours, 3]  # (n1,k1)
-        records["group_sa1"][k, ..., 1:] = cloud[neighbours] - xyz[:, None]  # (n1,k1,3)
-        records["idx_sa2"][k] = group_ball(xyz, first_n2, sa2.r, sa2.n_n)
-        records["idx_sa3"][k] = group_ball(xyz[first_n2], first_n3, sa3.r, sa3.n_n)
-        records["stats"][k] = kitti.scan_stats(scan, xyz)
-    records["invalid"] = invalid
+        record["xyz"] = xyz = cloud[centroids]  # (n1,3)
+        record["group_sa1"][..., 0] = scan[neighbours, 3]  # (n1,k1)
+        record["group_sa1"][..., 1:] = cloud[neighbours] - xyz[:, None]  # (n1,k1,3)
+        # One sampling serves all layers. Farthest point sampling of SA1's centroids would choose
+        # them in the same order again, so SA2's are the first n2 of them, and SA3's the first n3.
+        first_n2, first_n3 = np.arange(sa2.n_fps), np.arange(sa3.n_fps)
+        record["idx_sa2"] = group_ball(xyz, first_n2, sa2.r, sa2.n_n)  # (n2,k2)
+        record["idx_sa3"] = group_ball(xyz[first_n2], first_n3, sa3.r, sa3.n_n)  # (n3,k3)
+        record["stats"], record["invalid"] = kitti.scan_stats(scan, xyz), invalid
     return records
 
 
 class Batch(NamedTuple):
-    """The network's input as tensors: C scans and B pairs (P, Q) of them.
-
-    A scan may serve as P in one pair and as Q in another.
-    """
+    """The network's input: C scans and B pairs (P, Q) of them. A scan may be in several pairs."""
 
     xyz: torch.Tensor  # (C,n1,3) centroids
     group_sa1: torch.Tensor  # (C,n1,k1,4)
@@ -282,17 +269,14 @@ def make_batch(records, p, q, config, device="cpu"):
 
 
 def neighbours_in_q(xyz, p, q, k):
-    """For every pair (P, Q) the k nearest centroids of Q for each centroid of P, see `group_knn`.
-
-    Centroids xyz (C,n,3) and index arrays p, q (B,) -> (B,n,k). On a device other than the CPU the
-    search runs there, by a matrix of all distances, to avoid waiting for the CPU.
-    """
+    """`group_knn` for every pair: centroids xyz (C,n,3) and index arrays p, q (B,) -> (B,n,k)."""
     if xyz.device.type == "cpu":
         xyz = xyz.numpy()
         return torch.from_numpy(np.stack([group_knn(xyz[j], xyz[i], k) for i, j in zip(p, q)]))
+    # Elsewhere by a matrix of all distances, to avoid waiting for the CPU
     distances = torch.cdist(xyz[p], xyz[q], compute_mode="donot_use_mm_for_euclid_dist")  # exact
     idx = distances.topk(min(k, xyz.shape[1]), largest=False).indices  # nearest first
-    repeated = idx[..., :1].expand(-1, -1, k - idx.shape[2])  # the nearest, if points are missing
+    repeated = idx[..., :1].expand(-1, -1, k - idx.shape[2])
     return torch.cat([idx, repeated], 2)
 
 
@@ -554,17 +538,17 @@ def fit(net, data, run, test=(), seed=0, device="cpu", objective=None, checkpoin
         **facts):
     """Train `net` in place as `net.config` says (section 4), and write RUN/weights.pt.
 
-    data: a list with a tuple for each sequence, its records (n,) and T_{t,t+1} (n-1,4,4).
+    data: for each sequence a tuple of its records (n,) and its T_{t,t+1} (n-1,4,4).
     test: the same for the test sequences. Their loss is reported after every epoch, no more.
     seed: random seed for pair order and augmentation.
     objective: a module (y_hat, y) -> loss. None: eq. 2.
-    checkpoint: the content of a checkpoint to continue from.
+    checkpoint: the content of RUN/checkpoint.pt, to continue from it.
     say: called with each line to report.
     facts: values to store with the weights, see `training_facts`.
 
     RUN/checkpoint.pt holds all that a step changes, and a batch depends on the seed and its number
     alone. So a resumed run ends with the same weights, bit for bit. Raises ValueError if the loss,
-    a weight or a statistic is not finite; nothing further is stored then.
+    a weight or a statistic is not finite; nothing is stored from then on.
     """
     config, run, objective = net.config, Path(run), (objective or MeanAbsoluteError()).to(device)
     net.to(device)
@@ -582,8 +566,7 @@ def fit(net, data, run, test=(), seed=0, device="cpu", objective=None, checkpoin
     def update_statistics(net):  # takes the first element of each (Batch, T)
         update_bn(batches(data, config, (seed, 2**31), 0, min(25, steps), device), net)
 
-    def inference_copy():
-        """The network in eval mode. Running statistics that lag behind the weights are updated."""
+    def inference_copy():  # running statistics lag behind the weights, so they are updated
         trained = copy.deepcopy(net)
         if step <= frozen_from:
             update_statistics(trained)
@@ -591,9 +574,9 @@ def fit(net, data, run, test=(), seed=0, device="cpu", objective=None, checkpoin
 
     def require_finite(x, name):
         if not math.isfinite(x):
-            kept = "; the last checkpoint was kept" * (run / "checkpoint.pt").exists()
             raise ValueError(f"{run}: {name} became non-finite at step {step} (learning rate "
-                             f"{rate:.1e}){kept}. Try a lower learning rate")
+                             f"{rate:.1e}); the last checkpoint, if any, was kept. Try a lower "
+                             "learning rate")
 
     def store(name, net, **content):
         total = sum(tensor.double().sum().item() for tensor in net.state_dict().values())
@@ -617,9 +600,9 @@ def fit(net, data, run, test=(), seed=0, device="cpu", objective=None, checkpoin
         losses.append(loss.item())
         step += 1
 
-        epoch, now = step // per_epoch, time.monotonic()
+        now = time.monotonic()
         if step % per_epoch == 0:
-            line = f"epoch {epoch}/{config.epochs}: loss {np.mean(losses):.4f}"
+            line = f"epoch {step // per_epoch}/{config.epochs}: loss {np.mean(losses):.4f}"
             if test:
                 test_loss = held_out_loss(inference_copy(), objective, test, device)
                 require_finite(test_loss, "the test loss")
@@ -803,22 +786,6 @@ def relative_pose(scan_p: np.ndarray, scan_q: np.ndarray, weights: str | Path | 
     odometry = Odometry(weights, refine=refine)
     odometry.register(scan_p)
     return odometry.register(scan_q)
-
-
-def check_number(name, value, most=2**63 - 1):
-    """Raise ValueError unless a value is an integer from 0 to `most`."""
-    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not (whole and 0 <= value <= most):
-        raise ValueError(f"{name} must be a non-negative integer, at most {most:,}, not {value!r}")
-
-
-def check_device(device):
-    """Raise ValueError if this PyTorch cannot use the device."""
-    try:
-        torch.empty(1, device=device).cpu()
-    except (RuntimeError, AssertionError, NotImplementedError):
-        raise ValueError(f"device {device}: this PyTorch cannot use it; use cpu, or install a "
-                         "PyTorch for it") from None
 
 
 # ------------------------------------------------------------------------------------------------
@@ -1063,6 +1030,22 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
 SIMULATED = Path("data/simulated")  # the simulated city, used without --data
 
 
+def check_number(name, value, most=2**63 - 1):
+    """Raise ValueError unless a value is an integer from 0 to `most`."""
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not (whole and 0 <= value <= most):
+        raise ValueError(f"{name} must be a non-negative integer, at most {most:,}, not {value!r}")
+
+
+def check_device(device):
+    """Raise ValueError if this PyTorch cannot use the device."""
+    try:
+        torch.empty(1, device=device).cpu()
+    except (RuntimeError, AssertionError, NotImplementedError):
+        raise ValueError(f"device {device}: this PyTorch cannot use it; use cpu, or install a "
+                         "PyTorch for it") from None
+
+
 def check_output(out, root):
     """Raise ValueError unless results can go to `out`, a new or empty folder outside the data.
 
@@ -1152,9 +1135,8 @@ def read_run(run):
         data, sequences, seed, weights = (arguments[name] for name in
                                           ("data", "sequences", "seed", "weights"))
         check_number("seed", seed)
-        paths_are_sound = all(path is None or isinstance(path, str) for path in (data, weights))
-        names_are_sound = type(sequences) is list and all(isinstance(n, str) for n in sequences)
-        if not (paths_are_sound and names_are_sound):
+        texts = [*sequences, *(path for path in (data, weights) if path is not None)]
+        if type(sequences) is not list or not all(isinstance(text, str) for text in texts):
             raise ValueError("damaged")
     except (ValueError, KeyError, TypeError, AttributeError, OSError):
         raise ValueError(f"{run}/config.json: missing or damaged, so there is no training run to "
@@ -1197,7 +1179,8 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
             checkpoint = earlier = read_archive(stored)
     elif weights:
         net, earlier = load_weights(weights, network)
-        net.config = replace(net.config, **{name: getattr(config, name) for name in TRAINING})
+        settings = {name: getattr(config, name) for name in SHORT if name != "max_range"}
+        net.config = replace(net.config, **settings)
 
     # The data. All scans are read, so that an unusable one is found now and not after the training
     root = data_root(data, sequences, whole=True)
@@ -1217,8 +1200,14 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     versions = kitti.versions(Path(__file__).parent) | {"d3dlo": __version__}
     run = Path(out) if resume else claim_output(out, "runs", "config.json", {
         "arguments": arguments, "config": net.config.as_dict(), "versions": versions})
+
+    def say(line):
+        """Print a line and append it to the log."""
+        with open(run / "log.txt", "a", encoding="utf-8") as file:
+            file.write(line + "\n")
+        print(line, flush=True)
+
     try:
-        say = functools.partial(print_and_log, run / "log.txt")
         parameters = sum(p.numel() for p in net.parameters())
         say(f"{parameters:,} parameters, {sum(map(len, motions)):,} pairs of scans of "
             f"{' '.join(names)}, {net.config.epochs} epochs of {per_epoch} batches -> {run}")
@@ -1239,13 +1228,6 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     return run
 
 
-def print_and_log(log, line):
-    """Print a line and append it to a log file."""
-    with open(log, "a", encoding="utf-8") as file:
-        file.write(line + "\n")
-    print(line, flush=True)
-
-
 def command_line(argv):
     """Parse the arguments. Returns {option: value} of the options given.
 
@@ -1258,7 +1240,8 @@ def command_line(argv):
         "`train --help` and `eval --help` show all options, with examples."))
     parser.add_argument("--version", action="version", version=f"d3dlo {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="train | eval")
-    train_options(commands.add_parser(
+
+    add = commands.add_parser(
         "train", help="train, then evaluate on the test and validation splits", **settings,
         description=(
             "Train D3DLO, then evaluate it on the test and validation splits.\n\n"
@@ -1266,42 +1249,26 @@ def command_line(argv):
             "  python d3dlo.py train --data ROOT\n"
             "  python d3dlo.py train --data ROOT --sequences 00 01 --short --epochs 20\n"
             "  python d3dlo.py train --data ROOT --weights d3dlo.pt --short --lr 0.002\n"
-            "  python d3dlo.py train --out RUN --resume")))
-    eval_options(commands.add_parser(
-        "eval", **settings, help="predict trajectories and print KITTI's errors", description=(
-            "Predict the trajectories of sequences, write them and print KITTI's errors.\n"
-            "A plain folder of scans (*.bin or *.npy) gives a trajectory only.\n\n"
-            "  python d3dlo.py eval\n"
-            "  python d3dlo.py eval --data FOLDER --plot\n"
-            "  python d3dlo.py eval --data ROOT --sequences test\n"
-            "  python d3dlo.py eval --data ROOT --weights RUN --sequences 11 12")))
-    return vars(parser.parse_args(argv))
-
-
-def train_options(command):
-    """Add the options of `train`."""
-    add = command.add_argument
+            "  python d3dlo.py train --out RUN --resume")).add_argument
     add("--data", metavar="ROOT", help=(
         f"folder in KITTI odometry layout (default: a simulated city, made in {SIMULATED})"))
     add("--sequences", nargs="+", metavar="NN", help=(
         "names, or splits: train, test, validation, all (default: the training split)"))
-    add("--weights", metavar="FILE|RUN", help=(
-        "start from these weights and keep their network and input settings"))
-    add("--neighbors", type=int, metavar="N", help=(
-        f"neighbours in the first set abstraction, n_n in Table 2 (default: {Config.sa1.n_n})"))
-    add("--no-plane", action="store_false", dest="plane", help=(
-        "remove the points of the ground plane, Table 2"))
     add("--short", action="store_true", help=(
         "our short recipe, the default without --data: few epochs, points within 50 m, both "
         "directions, Muon, one-cycle learning rate, augmentation, fixed BatchNorm statistics at "
         "the end"))
-    add("--epochs", type=int, metavar="N", help=(
-        f"number of epochs (default: {Config.epochs}; with --short {SHORT['epochs']})"))
-    add("--batch", type=int, metavar="N", help=(
-        f"pairs in a batch (default: {Config.batch}; with --short {SHORT['batch']})"))
-    add("--lr", type=float, metavar="X", help=(
-        "initial (with --short, peak) learning rate "
-        f"(default: {Config.lr}; with --short {SHORT['lr']})"))
+    for name, kind, what in (("epochs", int, "number of epochs"),
+                             ("batch", int, "pairs in a batch"),
+                             ("lr", float, "initial learning rate; with --short, the peak")):
+        add(f"--{name}", type=kind, metavar="N", help=(
+            f"{what} (default: {getattr(Config, name)}; with --short {SHORT[name]})"))
+    add("--neighbors", type=int, metavar="N", help=(
+        f"neighbours in the first set abstraction, n_n in Table 2 (default: {Config.sa1.n_n})"))
+    add("--no-plane", action="store_false", dest="plane", help=(
+        "remove the points of the ground plane, Table 2"))
+    add("--weights", metavar="FILE|RUN", help=(
+        "start from these weights and keep their network and input settings"))
     add("--seed", type=int, metavar="N", help=(
         "random seed for initialisation, pair order and augmentation (default: 0)"))
     add("--device", help="cpu, cuda or mps (default: cpu)")
@@ -1309,10 +1276,14 @@ def train_options(command):
     add("--resume", action="store_true", help=(
         "continue the training run in --out with the options it was started with"))
 
-
-def eval_options(command):
-    """Add the options of `eval`."""
-    add = command.add_argument
+    add = commands.add_parser(
+        "eval", **settings, help="predict trajectories and print KITTI's errors", description=(
+            "Predict the trajectories of sequences, write them and print KITTI's errors.\n"
+            "A plain folder of scans (*.bin or *.npy) gives a trajectory only.\n\n"
+            "  python d3dlo.py eval\n"
+            "  python d3dlo.py eval --data FOLDER --plot\n"
+            "  python d3dlo.py eval --data ROOT --sequences test\n"
+            "  python d3dlo.py eval --data ROOT --weights RUN --sequences 11 12")).add_argument
     add("--data", metavar="ROOT", help=(
         "folder in KITTI odometry layout, or folder of scans (default: a simulated city, made in "
         f"{SIMULATED})"))
@@ -1330,6 +1301,7 @@ def eval_options(command):
         "new folder for the trajectories and results.json (default: results/TIME)"))
     add("--plot", action="store_true", help=(
         "draw the paths and the errors by length; needs matplotlib"))
+    return vars(parser.parse_args(argv))
 
 
 def config_from(args):
