@@ -17,6 +17,7 @@ sequences have 2,620 scans and take 4.2 GB. Needs NumPy and SciPy.
 """
 import argparse
 import ctypes
+import errno
 import functools
 import hashlib
 import importlib.metadata
@@ -705,16 +706,20 @@ def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int
     Raises FileNotFoundError for a missing file, naming its archive, and ValueError for a damaged
     one or if ROOT holds such a sequence already. ROOT is then unchanged.
     """
-    drive, root = Path(os.path.abspath(drive)), Path(root)  # a link keeps its own place
+    drive, root = Path(os.path.abspath(drive)), Path(root)  # not resolved: a link keeps its place
     match = re.fullmatch(r"((\d{4}_\d\d_\d\d)_drive_\d+)_sync", drive.name)
     if not match:
         raise ValueError(f"{drive} is not a drive of KITTI's raw data: give a folder such as "
                          "2011_09_26/2011_09_26_drive_0013_sync, of the synced+rectified data.")
     name, date = match.groups()
-    archive = f"{name}_sync.zip"
-    numbers, scans, times = _raw_stream(drive / "velodyne_points", ".bin", archive)
-    _, packets, packet_times = _raw_stream(drive / "oxts", ".txt", archive)
-    Tr, T_velo_imu = _raw_calib(drive.parent, f"{date}_calib.zip")
+    try:
+        numbers, scans, times = _raw_stream(drive / "velodyne_points", ".bin")
+        _, packets, packet_times = _raw_stream(drive / "oxts", ".txt")
+        packets = np.stack([_read_packet(path) for path in packets])  # (m,30)
+        Tr, T_velo_imu = _raw_calib(drive.parent)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{error.filename} does not exist: unpack {name}_sync.zip and "
+                                f"{date}_calib.zip.") from None
     for path in scans:
         _check_size(path, path.stat().st_size)
 
@@ -724,25 +729,24 @@ def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int
     has_pose = np.flatnonzero(np.abs(delay) < MAX_DELAY)
     if not len(has_pose):
         raise ValueError(f"{drive}: no scan was taken within 0.1 s of a GPS/IMU packet; "
-                         f"unpack {archive} again.")
-    packets = np.stack([_read_packet(path) for path in packets])  # (m,30)
-    T_imu = _imu_poses(packets, nearest, delay / SECOND)  # (n,4,4)
-    poses = velo_to_camera(T_imu, Tr @ T_velo_imu)  # from the IMU's frame to the camera's
+                         f"unpack {name}_sync.zip again.")
+    T_imu = _imu_poses(packets[nearest], delay / SECOND)  # (n,4,4)
 
     # Split the drive at the gaps, and write all parts or none
     runs = np.split(has_pose, np.flatnonzero(np.diff(numbers[has_pose]) != 1) + 1)
-    names = [name] if len(runs) == 1 else [f"{name}-{i + 1}" for i in range(len(runs))]
-    for path in [root / "sequences" / name for name in names] + [
-            root / "poses" / f"{name}.txt" for name in names]:
-        if path.exists():
-            raise ValueError(f"{path} already exists: remove it or choose another ROOT.")
-    with ExitStack() as parts:
-        for name, run in zip(names, runs):
-            folder = parts.enter_context(new_folder(root / "sequences" / name))
+    parts = {f"{name}-{i}" if len(runs) > 1 else name: run for i, run in enumerate(runs, 1)}
+    for part in parts:
+        for path in (root / "sequences" / part, root / "poses" / f"{part}.txt"):
+            if path.exists():
+                raise ValueError(f"{path} already exists: remove it or choose another ROOT.")
+    with ExitStack() as folders:
+        for part, run in parts.items():
+            folder = folders.enter_context(new_folder(root / "sequences" / part))
             _write_raw_sequence(folder, [scans[i] for i in run], Tr, times[run])
-        for name, run in zip(names, runs):
-            write_poses(root / "poses" / f"{name}.txt", invert(poses[run[0]]) @ poses[run])
-    return {name: (int(numbers[run[0]]), int(numbers[run[-1]])) for name, run in zip(names, runs)}
+        for part, run in parts.items():
+            T = invert(T_imu[run[0]]) @ T_imu[run]  # relative to the first pose, IMU frame
+            write_poses(root / "poses" / f"{part}.txt", velo_to_camera(T, Tr @ T_velo_imu))
+    return {part: (int(numbers[run[0]]), int(numbers[run[-1]])) for part, run in parts.items()}
 
 
 def _write_raw_sequence(folder, scans, Tr, times):
@@ -760,32 +764,25 @@ def _write_raw_sequence(folder, scans, Tr, times):
     (folder / "times.txt").write_text("".join(f"{t:.6f}\n" for t in seconds))
 
 
-def _require_file(path, archive):
-    """Raise FileNotFoundError, naming its archive, if one of KITTI's files is missing."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path} does not exist: it is in {archive}.")
-
-
-def _raw_stream(folder, suffix, archive):
+def _raw_stream(folder, suffix):
     """List the files of a stream that have a time: numbers (n,), paths (list), times (n,).
 
     Line i of timestamps.txt, counted from 0, is the time of file i, to the nanosecond. It is blank
     where the recording has lost a file, as in drive 2011_09_26_drive_0009.
     """
-    stamps = folder / "timestamps.txt"
+    lines = (folder / "timestamps.txt").read_text().splitlines()
     paths = sorted(path for path in folder.glob(f"data/*{suffix}") if path.stem.isdecimal())
-    _require_file(stamps, archive)
-    _require_file(paths[0] if paths else folder / "data" / f"0000000000{suffix}", archive)
-    numbers = np.array([int(path.stem) for path in paths])
+    numbers = np.array([int(path.stem) for path in paths], int)
+    if not paths:
+        raise FileNotFoundError(errno.ENOENT, "", str(folder / "data" / f"0000000000{suffix}"))
     try:
-        lines = [line.strip() for line in stamps.read_text().splitlines()]
-        times = np.array(lines, "datetime64[ns]")[numbers]  # a blank line becomes NaT
+        times = np.array([line.strip() for line in lines], "datetime64[ns]")[numbers]
     except (ValueError, IndexError):
         times = np.full(len(paths), np.datetime64("NaT"))
-    known = np.flatnonzero(~np.isnat(times))
+    known = np.flatnonzero(~np.isnat(times))  # a blank line becomes NaT, "not a time"
     if not len(known):
-        raise ValueError(f"{stamps} is damaged: line i should hold the time of file i, such as "
-                         f"2011-09-26 13:10:51.158069617; unpack {archive} again.")
+        raise ValueError(f"{folder}/timestamps.txt is damaged: line i should hold the time of file "
+                         "i, such as 2011-09-26 13:10:51.158069617; unpack the drive again.")
     return numbers[known], [paths[i] for i in known], times[known]
 
 
@@ -801,17 +798,15 @@ def _read_packet(path):
     return packet
 
 
-def _raw_calib(folder, archive):
+def _raw_calib(folder):
     """Read the calib_*.txt of a date: Tr (4,4), Velodyne to rectified camera, and T_velo_imu."""
     def transform(name, rotation, translation=None):
-        path = folder / name
-        _require_file(path, archive)
-        R = _calib_row(path, rotation, 9).reshape(3, 3)
-        t = _calib_row(path, translation, 3) if translation else np.zeros(3)
+        R = _calib_row(folder / name, rotation, 9).reshape(3, 3)
+        t = _calib_row(folder / name, translation, 3) if translation else np.zeros(3)
         row = np.column_stack([R, t])  # (3,4)
         if not is_rigid(row):
-            raise ValueError(f"{path} is damaged: its row {rotation!r} should hold a rotation, "
-                             f"and 'T' a translation; unpack {archive} again.")
+            raise ValueError(f"{folder / name} is damaged: its row {rotation!r} should hold a "
+                             "rotation, and 'T' a translation; unpack the date's calib.zip again.")
         return np.vstack([row, [0, 0, 0, 1]])  # (4,4)
 
     rectify = transform("calib_cam_to_cam.txt", "R_rect_00")
@@ -820,30 +815,29 @@ def _raw_calib(folder, archive):
     return rectify @ T_cam_velo, T_velo_imu
 
 
-def _imu_poses(packets, nearest, delay):
+def _imu_poses(packets, delay):
     """Poses T_wi (n,4,4) of the GPS/IMU unit (x forward, y left, z up) at the times of the scans.
 
-    packets (m,30); nearest (n,): the packet nearest to each scan; delay (n,): time from the packet
-    to the scan [s]. The world is x east, y north, z up, in metres.
+    packets (n,30): the packet nearest to each scan; delay (n,): time from the packet to the scan
+    [s]. The world is x east, y north, z up, in metres.
 
-    The pose of a packet is that of the devkit's convertOxtsToPose.m: a Mercator projection with
-    the scale of the drive's first latitude, and roll, pitch, yaw about x, y, z in that order.
-    From there to the scan, velocity and turn rate are taken as constant. The unit then moves along
-    an arc, whose chord has the direction of the velocity half-way.
+    The pose of a packet is that of the devkit's convertOxtsToPose.m: a Mercator projection, and
+    roll, pitch, yaw about x, y, z in that order. From there to the scan, velocity and turn rate are
+    taken as constant. The unit then moves along an arc, whose chord has the direction of the
+    velocity half-way.
     """
-    scale = EARTH_RADIUS * np.cos(np.radians(packets[0, 0]))
-    packets, delay = packets[nearest], delay[:, None]  # (n,30), (n,1)
     lat, lon, alt = packets[:, LAT_LON_ALT].T
+    scale = EARTH_RADIUS * np.cos(np.radians(lat[0]))
     east = scale * np.radians(lon)
     north = scale * np.log(np.tan(np.radians(90 + lat) / 2))
-    position = np.stack([east, north, alt], axis=1)  # (n,3)
     attitude = Rotation.from_euler("xyz", packets[:, ROLL_PITCH_YAW])
     # Rotation vectors along the axes of the world (n,3)
-    turn = attitude.apply(packets[:, ANGULAR_VELOCITY]) * delay
+    turn = attitude.apply(packets[:, ANGULAR_VELOCITY]) * delay[:, None]
     half_turn = Rotation.from_rotvec(turn / 2)
     T = np.tile(np.eye(4), (len(packets), 1, 1))  # (n,4,4)
     T[:, :3, :3] = (Rotation.from_rotvec(turn) * attitude).as_matrix()
-    T[:, :3, 3] = position + half_turn.apply(packets[:, VELOCITY] * delay)
+    T[:, :3, 3] = np.stack([east, north, alt], axis=1)
+    T[:, :3, 3] += half_turn.apply(packets[:, VELOCITY] * delay[:, None])
     return T
 
 
