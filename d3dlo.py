@@ -264,7 +264,7 @@ def make_batch(records, p, q, config, device="cpu"):
     """Records (C,) and index arrays p, q (B,) -> Batch. Torch needs int64 indices."""
     idx_sa2, idx_sa3 = records["idx_sa2"].astype(np.int64), records["idx_sa3"].astype(np.int64)
     arrays = records["xyz"], records["group_sa1"], idx_sa2, idx_sa3, p, q
-    tensors = [to_device(array, device) for array in arrays]
+    tensors = [torch.from_numpy(np.ascontiguousarray(array)).to(device) for array in arrays]
     return Batch(*tensors, neighbours_in_q(tensors[0], p, q, config.fe.n_n))
 
 
@@ -278,14 +278,6 @@ def neighbours_in_q(xyz, p, q, k):
     idx = distances.topk(min(k, xyz.shape[1]), largest=False).indices  # nearest first
     repeated = idx[..., :1].expand(-1, -1, k - idx.shape[2])
     return torch.cat([idx, repeated], 2)
-
-
-def to_device(array, device):
-    """NumPy array -> tensor on a device. Copies to a GPU do not block."""
-    tensor = torch.from_numpy(np.ascontiguousarray(array))
-    if torch.device(device).type == "cuda":
-        tensor = tensor.pin_memory()
-    return tensor.to(device, non_blocking=True)
 
 
 # ------------------------------------------------------------------------------------------------
@@ -519,7 +511,7 @@ def make_scheduler(optimizer, config, steps):
 
 def loss_of(net, objective, batch, T):
     """The loss () of a Batch with the true motions T (B,4,4)."""
-    y = to_device(net.encode(T).astype(np.float32), batch.xyz.device)  # (B,6)
+    y = torch.from_numpy(net.encode(T).astype(np.float32)).to(batch.xyz.device)  # (B,6)
     return objective(net(batch), y)
 
 
@@ -559,9 +551,10 @@ def fit(net, data, run, test=(), seed=0, device="cpu", objective=None, checkpoin
     schedulers = [make_scheduler(optimizer, config, steps) for optimizer in optimizers]
     parts, step, losses = [net, objective, *optimizers, *schedulers], 0, []  # losses of this epoch
     if checkpoint:
-        step, losses = checkpoint["step"], checkpoint["losses"]
-        for part, state in zip(parts, checkpoint["parts"], strict=True):
-            part.load_state_dict(state)
+        with reading_weights(run / "checkpoint.pt"):
+            step, losses = checkpoint["step"], checkpoint["losses"]
+            for part, state in zip(parts, checkpoint["parts"], strict=True):
+                part.load_state_dict(state)
 
     def update_statistics(net):  # takes the first element of each (Batch, T)
         update_bn(batches(data, config, (seed, 2**31), 0, min(25, steps), device), net)
@@ -970,14 +963,11 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
 
     data: a folder in KITTI's layout, or a plain folder of scans, which gives a trajectory only.
         None: the simulated city.
-    weights: a weights file or the folder of a training run. None: the pretrained weights.
     sequences: a list of names or splits. None: all, or the simulated test and validation splits.
     out: a new or empty folder to write to. None: a new one, results/TIME.
-    device: cpu, cuda or mps.
-    refine: number of refinement passes, see `refine_pose`.
     plot: also draw OUT/plot.png.
     say: called with the text to print.
-    network: the class of the network.
+    weights, device, refine, network: see `Odometry`.
 
     Returns the folder `out`. Raises ValueError if an argument, the weights or the data are
     invalid, and OSError if a file cannot be read or written.
@@ -1099,19 +1089,19 @@ def choose_sequences(root, names=None):
     it, for all sequences outside the test and validation splits. Raises ValueError if there is
     nothing to train on.
     """
-    available, held_out = kitti.sequence_names(root), SPLITS["test"] + SPLITS["validation"]
+    available = kitti.sequence_names(root)
+    held_out = [n for n in SPLITS["test"] + SPLITS["validation"] if n in available]
     names = (names or [n for n in SPLITS["train"] if n in available]
              or [n for n in available if n not in held_out])
     if not names:
         raise ValueError(f"{root}: holds only test and validation sequences, "
                          f"{' '.join(available)}; choose those to train on with --sequences")
     chosen = kitti.open_sequences(root, names)
-    chosen_names = [s.name for s in chosen]
+    names = [s.name for s in chosen]
     if not sum(len(s) - 1 for s in chosen):
-        raise ValueError(f"{root}: sequence {' '.join(chosen_names)} has one scan; training needs "
-                         "at least two scans")
-    others = [n for n in held_out if n in available and n not in chosen_names]
-    return chosen, kitti.open_sequences(root, others)
+        raise ValueError(f"{root}: sequence {' '.join(names)} has one scan; training needs at "
+                         "least two scans")
+    return chosen, kitti.open_sequences(root, [n for n in held_out if n not in names])
 
 
 def training_facts(fingerprints, motions, records, earlier):
@@ -1152,12 +1142,9 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     data: a folder in KITTI's layout. None: the simulated city.
     sequences: a list of names or splits to train on. None: see `choose_sequences`.
     out: a new or empty folder for the training run. None: a new one, runs/TIME.
-    seed: random seed for initialisation, pair order and augmentation.
-    device: cpu, cuda or mps.
     resume: continue the run in `out`. Its config, data, sequences, seed and weights are used again.
     weights: start from these weights and keep their network and input settings.
-    network: the class of the network.
-    objective: the loss, see `fit`.
+    network, objective: the class of the network, and the loss; see `load_weights` and `fit`.
 
     Returns the folder `out`. Raises ValueError if an argument or the data are invalid or the loss
     is not finite, and OSError if a file cannot be read or written.
@@ -1240,20 +1227,29 @@ def command_line(argv):
         "`train --help` and `eval --help` show all options, with examples."))
     parser.add_argument("--version", action="version", version=f"d3dlo {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="train | eval")
+    both = argparse.ArgumentParser(add_help=False, argument_default=argparse.SUPPRESS)
+    add = both.add_argument
+    add("--data", metavar="ROOT", help=(
+        "folder in KITTI odometry layout; for eval also a folder of scans (default: a simulated "
+        f"city, made in {SIMULATED})"))
+    add("--sequences", nargs="+", metavar="NN", help=(
+        "names, or splits: train, test, validation, all (default for train: train; for eval: all, "
+        "or test and validation of the simulated city)"))
+    add("--weights", metavar="FILE|RUN", help=(
+        "a weights file, or the folder of a training run (default for eval: the pretrained "
+        "weights; train starts from these weights and keeps their network and input settings)"))
+    add("--device", help="cpu, cuda or mps (default: cpu)")
+    add("--out", metavar="DIR", help="new folder to write (default: runs/TIME or results/TIME)")
 
     add = commands.add_parser(
-        "train", help="train, then evaluate on the test and validation splits", **settings,
-        description=(
+        "train", help="train, then evaluate on the test and validation splits", parents=[both],
+        **settings, description=(
             "Train D3DLO, then evaluate it on the test and validation splits.\n\n"
             "  python d3dlo.py train\n"
             "  python d3dlo.py train --data ROOT\n"
             "  python d3dlo.py train --data ROOT --sequences 00 01 --short --epochs 20\n"
             "  python d3dlo.py train --data ROOT --weights d3dlo.pt --short --lr 0.002\n"
             "  python d3dlo.py train --out RUN --resume")).add_argument
-    add("--data", metavar="ROOT", help=(
-        f"folder in KITTI odometry layout (default: a simulated city, made in {SIMULATED})"))
-    add("--sequences", nargs="+", metavar="NN", help=(
-        "names, or splits: train, test, validation, all (default: the training split)"))
     add("--short", action="store_true", help=(
         "our short recipe, the default without --data: few epochs, points within 50 m, both "
         "directions, Muon, one-cycle learning rate, augmentation, fixed BatchNorm statistics at "
@@ -1267,38 +1263,24 @@ def command_line(argv):
         f"neighbours in the first set abstraction, n_n in Table 2 (default: {Config.sa1.n_n})"))
     add("--no-plane", action="store_false", dest="plane", help=(
         "remove the points of the ground plane, Table 2"))
-    add("--weights", metavar="FILE|RUN", help=(
-        "start from these weights and keep their network and input settings"))
     add("--seed", type=int, metavar="N", help=(
         "random seed for initialisation, pair order and augmentation (default: 0)"))
-    add("--device", help="cpu, cuda or mps (default: cpu)")
-    add("--out", metavar="RUN", help="new folder for the training run (default: runs/TIME)")
     add("--resume", action="store_true", help=(
         "continue the training run in --out with the options it was started with"))
 
     add = commands.add_parser(
-        "eval", **settings, help="predict trajectories and print KITTI's errors", description=(
+        "eval", help="predict trajectories and print KITTI's errors", parents=[both], **settings,
+        description=(
             "Predict the trajectories of sequences, write them and print KITTI's errors.\n"
             "A plain folder of scans (*.bin or *.npy) gives a trajectory only.\n\n"
             "  python d3dlo.py eval\n"
             "  python d3dlo.py eval --data FOLDER --plot\n"
             "  python d3dlo.py eval --data ROOT --sequences test\n"
             "  python d3dlo.py eval --data ROOT --weights RUN --sequences 11 12")).add_argument
-    add("--data", metavar="ROOT", help=(
-        "folder in KITTI odometry layout, or folder of scans (default: a simulated city, made in "
-        f"{SIMULATED})"))
-    add("--sequences", nargs="+", metavar="NN", help=(
-        "names, or splits: train, test, validation, all (default: all; without --data, the test "
-        "and validation splits)"))
-    add("--weights", metavar="FILE|RUN", help=(
-        "weights, or the folder of a training run (default: the pretrained weights)"))
     add("--refine", type=int, metavar="N", help=(
         "not in the paper: refine each pose in N passes, each with its own sampling of the scan, "
         "the first against a keyframe, the others against the last scan; 3 is recommended "
         "(default: 0)"))
-    add("--device", help="cpu, cuda or mps (default: cpu)")
-    add("--out", metavar="DIR", help=(
-        "new folder for the trajectories and results.json (default: results/TIME)"))
     add("--plot", action="store_true", help=(
         "draw the paths and the errors by length; needs matplotlib"))
     return vars(parser.parse_args(argv))

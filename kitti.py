@@ -1,15 +1,12 @@
 """The data: KITTI odometry scans, calibration, frames, splits, ground plane, simulated city.
 
 A scan is an array (N,4) float32: x, y, z [m] in the Velodyne frame (x forward, y left, z up) and
-intensity [0..1]. `T_ab` maps points from frame b to frame a.
-
-KITTI's pose files are in the frame of the rectified left camera. The points are in the Velodyne
-frame, so `poses` and `motions()` of a sequence are, too: T_velo = inv(Tr) @ T_cam @ Tr.
+intensity [0..1]. `T_ab` maps points from frame b to frame a. KITTI's pose files are in the frame of
+the rectified left camera; `poses` and `motions()` of a sequence are in the Velodyne frame, as the
+points are: T_velo = inv(Tr) @ T_cam @ Tr.
 
 The simulated city can be used in place of KITTI: a car with an HDL-64E drives through 11 small
-cities, one for each sequence. There is oncoming, cross and same-direction traffic with queues at
-lights, and there are roundabouts, ramps and motorways. The ground truth is exact. Together the 11
-sequences have 2,620 scans and take 4.2 GB. Needs NumPy and SciPy.
+cities, one for each sequence, with exact ground truth: 2,620 scans, 4.2 GB.
 
     python kitti.py simulate data/city
     python kitti.py simulate data/tiny --sequences 00 07 --scans 40 --azimuth 900
@@ -115,8 +112,9 @@ FIVE_FLOATS = ("nuScenes files have five floats per point: convert each with "
 OTHER_FORMATS = b"\x93NUMPY", b"ply\n", b"ply\r", b"# .PCD"  # how files of other formats begin
 
 
-def _check_size(path, size):
-    """Raise ValueError unless a .bin file of `size` bytes can hold a scan."""
+def _check_size(path, size=None):
+    """Raise ValueError unless a .bin file can hold a scan, by its size in bytes."""
+    size = path.stat().st_size if size is None else size
     if size == 0 or size % 16:
         raise ValueError(f"{path} has {size} bytes, but a scan has 16 (four float32) per point: "
                          "if it is truncated, copy or unpack it again; if it has other columns, "
@@ -152,13 +150,12 @@ def _read_npy(path):
     """The array (N,3) or (N,4) of a .npy file."""
     try:
         points = np.load(path, allow_pickle=False)
+        shape, kind = points.shape, points.dtype.kind
     except OSError:
         raise
     except Exception:  # np.load raises many exception types; all of them mean a corrupt file
         raise ValueError(f"{path} is damaged or not a NumPy file: save the scan again.") from None
-    shape = getattr(points, "shape", ())  # an archive of several arrays has no shape
-    if (len(shape) != 2 or shape[0] == 0 or shape[1] not in (3, 4)
-            or points.dtype.kind not in "fiu"):
+    if len(shape) != 2 or shape[0] == 0 or shape[1] not in (3, 4) or kind not in "fiu":
         raise ValueError(f"{path} has shape {shape}, but a scan is an array of numbers (N,3) or "
                          "(N,4): save the columns x, y, z and intensity.")
     return points
@@ -224,10 +221,9 @@ class Sequence:
 
     name, folder; scan_paths: list of n paths; intensity_max: intensities are divided by it;
     Tr (4,4): T_cam0_velo; poses_cam (n,4,4): the poses as in the file; poses (n,4,4): T_0t in the
-    Velodyne frame. The last three are None in a plain folder, the poses also without ground truth.
-    times (n,) [s], of a plain folder only. notes: list of lines, one for each assumption made.
-    Raises FileNotFoundError for a missing file, and ValueError for a damaged one or if the files do
-    not fit together.
+    Velodyne frame. The last three are None where there are none. times (n,) [s], of a plain folder;
+    notes: list of lines, one for each assumption made. Raises FileNotFoundError for a missing file,
+    and ValueError for a damaged one or if the files do not fit together.
     """
 
     def __init__(self, folder, truth=None):
@@ -236,21 +232,12 @@ class Sequence:
         self.Tr = self.poses_cam = self.poses = None
         self.intensity_max, self.notes = 1, []
         if truth:
-            self._check_numbers()
-        if len({path.suffix for path in self.scan_paths}) > 1:
-            raise ValueError(f"{folder} holds both .bin and .npy files: move one kind elsewhere.")
-        for path in self.scan_paths:
-            if path.suffix == ".bin":
-                _check_size(path, path.stat().st_size)
-        if truth:
-            self._read_truth(truth)
+            self._open_kitti(truth)
         else:
-            self._note_gaps()
-            self._scale_intensities()
-            self._read_times()
+            self._open_folder()
 
-    def _check_numbers(self):
-        """Raise an error unless the scans are velodyne/000000.bin, 000001.bin and so on."""
+    def _open_kitti(self, truth):
+        """Check the scans; read calib.txt and, if it exists, the ground truth."""
         if not self.scan_paths:
             raise FileNotFoundError(f"{self.folder / 'velodyne'} holds no scans: unpack "
                                     "data_odometry_velodyne.zip; the other archives hold none.")
@@ -259,9 +246,7 @@ class Sequence:
                 raise ValueError(f"{path.parent} should hold {i:06d}.bin next but holds "
                                  f"{path.name}: scans are numbered from 000000 without a gap; "
                                  "unpack data_odometry_velodyne.zip again.")
-
-    def _read_truth(self, truth):
-        """Read calib.txt and, if it exists, the ground truth."""
+            _check_size(path)
         self.Tr = read_calib(self.folder / "calib.txt")
         if not truth.exists():
             return
@@ -272,58 +257,62 @@ class Sequence:
                              "archive again.")
         self.poses = camera_to_velo(self.poses_cam, self.Tr)  # (n,4,4)
 
-    def _note_gaps(self):
-        """Note missing scans if the files are numbered consecutively."""
-        if not all(path.stem.isdecimal() for path in self.scan_paths):
-            return
-        steps = np.diff([int(path.stem) for path in self.scan_paths])
-        gaps = np.flatnonzero(steps > 1)
-        if len(gaps) and np.median(steps) == 1:  # other numbers, such as times, have no gaps
-            self.notes.append(f"{(steps - 1).sum()} scans are missing, the first after "
-                              f"{self.scan_paths[gaps[0]].name}; the motion across a gap may be "
-                              "wrong")
+    def _open_folder(self):
+        """Check the scans; set intensity_max and times, and note what was assumed."""
+        if len({path.suffix for path in self.scan_paths}) > 1:
+            raise ValueError(f"{self.folder} holds both .bin and .npy files: move one kind "
+                             "elsewhere.")
+        for path in self.scan_paths:
+            if path.suffix == ".bin":
+                _check_size(path)
 
-    def _scale_intensities(self):
-        """Set intensity_max to 1 or 255, from ten scans spread over the folder.
+        # Missing scans of a folder that is numbered consecutively
+        if all(path.stem.isdecimal() for path in self.scan_paths):
+            steps = np.diff([int(path.stem) for path in self.scan_paths])
+            gaps = np.flatnonzero(steps > 1)
+            if len(gaps) and np.median(steps) == 1:  # other numbers, such as times, have no gaps
+                self.notes.append(f"{(steps - 1).sum()} scans are missing, the first after "
+                                  f"{self.scan_paths[gaps[0]].name}; the motion across a gap may "
+                                  "be wrong")
 
-        Raises ValueError for a value below 0 or above 255, which cannot be an intensity.
-        """
+        # Intensities 0 to 1 or 0 to 255, judged by ten scans spread over the folder
         largest = 0
         for i in np.unique(np.linspace(0, len(self) - 1, 10).astype(int)):
             intensity = self.scan(i)[:, 3]
             intensity = intensity[np.isfinite(intensity)]
-            if intensity.min(initial=0) < 0:
-                raise ValueError(f"{self.scan_paths[i]}: the fourth value of a point is "
-                                 f"{intensity.min():.4g}, but intensities are not negative, so "
-                                 f"this is not x, y, z, intensity. {FIVE_FLOATS}.")
-            if intensity.max(initial=0) > 255:
-                raise ValueError(f"{self.scan_paths[i]} has intensities up to "
-                                 f"{intensity.max():.4g}, but they must lie within 0..1 or "
-                                 "0..255: rescale those of all scans.")
-            largest = max(largest, intensity.max(initial=0))
+            low, high = intensity.min(initial=0), intensity.max(initial=0)
+            if low < 0:
+                raise ValueError(f"{self.scan_paths[i]}: the fourth value of a point is {low:.4g}, "
+                                 "but intensities are not negative, so this is not x, y, z, "
+                                 f"intensity. {FIVE_FLOATS}.")
+            if high > 255:
+                raise ValueError(f"{self.scan_paths[i]} has intensities up to {high:.4g}, but they "
+                                 "must lie within 0..1 or 0..255: rescale those of all scans.")
+            largest = max(largest, high)
         if largest > 1:
             self.intensity_max = 255
             self.notes.append(f"intensities reach {largest:.4g}; all are divided by 255")
         if largest == 0:
             self.notes.append("there are no intensities; zeros are used, so expect larger errors")
 
-    def _read_times(self):
-        """Read times.txt, one time in seconds per line, or assume 10 scans a second."""
-        path = self.folder / "times.txt"
-        if not path.exists():
+        if (self.folder / "times.txt").exists():
+            self.times = self._read_times(self.folder / "times.txt")
+        else:
             self.times = 0.1 * np.arange(len(self))
             self.notes.append("no times.txt (one time in seconds per line); "
                               "10 scans a second are assumed")
-            return
+
+    def _read_times(self, path):
+        """The times (n,) [s] in a times.txt, one per line."""
         try:
-            self.times = np.array([words[0] for _, words in read_lines(path)], dtype=float)
+            times = np.array([words[0] for _, words in read_lines(path)], dtype=float)
         except ValueError:
-            self.times = np.empty(0)
-        if len(self.times) != len(self) or not (np.isfinite(self.times).all()
-                                                and (np.diff(self.times) > 0).all()):
+            times = np.empty(0)
+        if len(times) != len(self) or not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
             raise ValueError(f"{path} must hold {len(self)} increasing numbers, the time of each "
                              "scan in seconds: correct it, or remove it to assume 10 scans a "
                              "second.")
+        return times
 
     def __len__(self):
         return len(self.scan_paths)
@@ -409,7 +398,7 @@ def open_sequences(root: str | Path, names: str | list[str] = "all") -> list[Seq
                              f"{' '.join([*splits, 'all', *available])}.")
         chosen += members
     if not (root / "sequences").exists():
-        return [Sequence(root)]
+        return [Sequence(root) for _ in dict.fromkeys(chosen)]
     return [Sequence(root / "sequences" / name, root / "poses" / f"{name}.txt")
             for name in dict.fromkeys(chosen)]
 
@@ -560,6 +549,8 @@ def in_processes(function, tasks, workers=None, chunksize=4):
     workers: number of processes, None for one per core; chunksize: tasks sent to a worker at once.
     Raises OSError if a worker dies.
     """
+    if not tasks:
+        return
     pool = ProcessPoolExecutor(workers or cores(), initializer=_leave_signals_to_parent)
     try:
         yield from pool.map(function, tasks, chunksize=chunksize)
@@ -618,47 +609,42 @@ def cached_records(sequences, compute, dtype, settings, cache="cache"):
     A file's name is a hash of all it depends on, and files are moved into place when complete, so
     two processes may share a cache. A file that NumPy cannot read is computed again.
     """
-    files = [Path(cache) / f"{s.name}-{_cache_key(s, settings, dtype)}.npy" for s in sequences]
-    missing = [(s, file) for s, file in zip(sequences, files) if not _is_intact(file, dtype, s)]
+    files, missing = [], []
+    for s in sequences:
+        stats = [path.stat() for path in s.scan_paths]  # ctime changes even where mtime is kept
+        scans = [(stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns) for stat in stats]
+        depends = str(s.folder.resolve()), scans, s.intensity_max, settings, dtype.descr
+        key = hashlib.sha256(repr(depends).encode()).hexdigest()[:16]
+        files.append(Path(cache) / f"{s.name}-{key}.npy")
+        if _load(files[-1], dtype, len(s)) is None:
+            missing.append((s, files[-1]))
     tasks = [(path, s.intensity_max) for s, _ in missing for path in s.scan_paths]
-    if tasks:
-        with closing(in_processes(compute, tasks)) as records:
-            records = progress(records, len(tasks), "sampling and grouping, scans")
-            for s, file in missing:
-                header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False,
-                          "shape": (len(s),)}
-                # Written record by record: a memory map would crash on a full disk
-                with replacing(file) as temporary, open(temporary, "wb") as out:
-                    np.lib.format.write_array_header_1_0(out, header)
-                    for _ in range(len(s)):
-                        out.write(next(records).tobytes())
-            next(records, None)  # lets the progress line end
-    return [np.load(file, mmap_mode="r") for file in files]
+    with closing(in_processes(compute, tasks)) as records:
+        records = progress(records, len(tasks), "sampling and grouping, scans")
+        for s, file in missing:
+            header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False,
+                      "shape": (len(s),)}
+            # Written record by record: a memory map would crash on a full disk
+            with replacing(file) as temporary, open(temporary, "wb") as out:
+                np.lib.format.write_array_header_1_0(out, header)
+                for _ in range(len(s)):
+                    out.write(next(records).tobytes())
+        next(records, None)  # lets the progress line end
+    return [_load(file, dtype, len(s)) for s, file in zip(sequences, files)]
 
 
-def _cache_key(sequence, settings, dtype):
-    """Hash of everything a cache file depends on.
-
-    The ctime of a scan changes even when its size and modification time are kept.
-    """
-    stats = [os.stat(path) for path in sequence.scan_paths]
-    scans = [(s.st_size, s.st_mtime_ns, s.st_ctime_ns) for s in stats]
-    depends = str(sequence.folder.resolve()), scans, sequence.intensity_max, settings, dtype.descr
-    return hashlib.sha256(repr(depends).encode()).hexdigest()[:16]
-
-
-def _is_intact(file, dtype, sequence):
-    """Whether a cache file exists and holds a record for every scan. Reports a damaged one."""
+def _load(file, dtype, n):
+    """The records (n,) in a cache file, or None. Reports a damaged file."""
     if not file.is_file():
-        return False
+        return None
     try:
         records = np.load(file, mmap_mode="r")  # pickles are off by default, so no code runs
-        if (records.dtype, records.shape) == (dtype, (len(sequence),)):
-            return True
+        if (records.dtype, records.shape) == (dtype, (n,)):
+            return records
     except Exception:  # np.load raises many exception types; all of them mean a corrupt file
         pass
     print(f"{file}: damaged, so it is computed again", file=sys.stderr)
-    return False
+    return None
 
 
 @contextmanager
@@ -690,18 +676,17 @@ def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int
     """Convert an unpacked "sync" drive of KITTI's raw data to odometry layout, with ground truth.
 
     `drive` is a folder such as 2011_09_26/2011_09_26_drive_0013_sync, with the date's calib_*.txt
-    in its parent folder. Writes the folder ROOT/sequences/2011_09_26_drive_0013 and the ground
-    truth ROOT/poses/2011_09_26_drive_0013.txt, in the rectified left camera's frame. Scans are hard
-    links where the file system allows it, else copies. A drive in which scans are missing is split
-    at the gaps, into sequences whose names end with -1, -2 ... Returns {name of a sequence:
-    (number of its first scan in the drive, of its last)}.
+    in its parent folder. Writes ROOT/sequences/2011_09_26_drive_0013 and its ground truth in
+    ROOT/poses, in the rectified left camera's frame. Scans are hard links where the file system
+    allows it, else copies. A drive in which scans are missing is split at the gaps, into sequences
+    whose names end with -1, -2 ... Returns {name of a sequence: (number of its first scan in the
+    drive, of its last)}.
 
-    The pose of a scan is that at its time in velodyne_points/timestamps.txt, the middle of the
-    revolution, when the scanner faces forward and triggers the cameras. The "sync" data is aligned
-    to this time. The GPS/IMU packet of a scan was recorded at another time, 12 to 25 ms later in
-    drive 0013. So the pose of the nearest packet is extrapolated to the scan's time with the
-    packet's velocity and angular velocity. The points are not corrected for the motion during the
-    0.1 s of a revolution.
+    The pose of a scan is that at the middle of its revolution, which is the time in
+    velodyne_points/timestamps.txt and to which the "sync" data is aligned. The nearest GPS/IMU
+    packet was recorded at another time, 12 to 25 ms later in drive 0013. So its pose is
+    extrapolated with its velocity and angular velocity. The points are not corrected for the motion
+    during the 0.1 s of a revolution.
 
     Raises FileNotFoundError for a missing file, naming its archive, and ValueError for a damaged
     one or if ROOT holds such a sequence already. ROOT is then unchanged.
@@ -721,7 +706,7 @@ def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int
         raise FileNotFoundError(f"{error.filename} does not exist: unpack {name}_sync.zip and "
                                 f"{date}_calib.zip.") from None
     for path in scans:
-        _check_size(path, path.stat().st_size)
+        _check_size(path)
 
     # The nearest packet of each scan, and the poses
     nearest = np.array([np.abs(packet_times - t).argmin() for t in times])  # (n,)
