@@ -59,7 +59,7 @@ __version__ = "0.3.0"
 
 
 class Layer(NamedTuple):
-    """A row of Table 1."""
+    """A row of Table 1; None where the table has a dash."""
 
     r: float | None  # radius of the ball [m]
     n_fps: int | None  # number of centroids kept by farthest point sampling
@@ -85,16 +85,17 @@ class Config:
 
     # Training, section 4
     epochs: int = 500
-    batch: int = 16  # pairs of scans in a batch, at least; the paper does not say
+    batch: int = 16  # pairs of scans in a batch, or a few more; the paper does not say
     optimizer: str = "adam"  # the paper's; or ours, "muon": Muon for the hidden layers
     lr: float = 1e-3  # learning rate: Adam's default; with "one-cycle" the peak
     schedule: str = "steps"  # lr / 10 (factor ours) after 3/5 and 4/5 of the steps; or "one-cycle"
     swap: str = "random"  # the paper's: one direction of each pair; or ours, "both"
     augment: bool = False  # ours: also mirror pairs and move Q by small random motions
-    frozen: float = 0.0  # ours: share of the steps, at the end, with fixed BatchNorm statistics
+    frozen: float = 0.0  # ours: share of the steps, at the end, with fixed BatchNorm statistics;
+    # the weights are still trained
 
     def __post_init__(self):
-        # JSON turns a Layer into a list. Turn it back; a frozen dataclass needs object.__setattr__.
+        # JSON turns a Layer into a list. Turn it back; an immutable class needs object.__setattr__.
         for name in ("sa1", "fe", "sa2", "sa3", "mpn", "mlp"):
             *numbers, widths = getattr(self, name)
             object.__setattr__(self, name, Layer(*numbers, tuple(widths)))
@@ -122,12 +123,13 @@ def check_config(config):
     require("n_n", [layer.n_n for layer in grouping], 1, 1024)
     require("number of widths", map(len, widths), 2, 16)
     require("width", itertools.chain(*widths), 1, 1024)
-    require("last width of mlp", config.mlp.widths[-1:], 6, 6)
     require("max_range", [] if config.max_range is None else [config.max_range], 1e-3, 1e3)
     require("epochs", [config.epochs], 1, 10**9)
     require("batch", [config.batch], 1, 10**6)
     require("lr", [config.lr], 1e-12, 1e3)
     require("frozen", [config.frozen], 0.0, 0.999)
+    if config.mlp.widths[-1] != 6:
+        raise ValueError("Config: the last width of mlp must be 6: translation and angles")
     for name, choices in dict(plane=(True, False), augment=(True, False), swap=("random", "both"),
                               optimizer=("adam", "muon"), schedule=("steps", "one-cycle")).items():
         if getattr(config, name) not in choices:
@@ -146,9 +148,9 @@ SHORT = dict(max_range=50.0, epochs=9, batch=8, optimizer="muon", lr=1e-2, sched
 def farthest_point_sampling(xyz: np.ndarray, n: int) -> np.ndarray:
     """Farthest point sampling: each new centroid is the point farthest from all centroids so far.
 
-    xyz (N,3), finite -> indices (n,) int64 of the centroids, the first of them 0. Ties go to the
-    first in order of x. Exact and nested: the first m indices are the result for n = m. Raises
-    ValueError unless 0 < n <= N.
+    xyz (N,3), finite -> indices (n,) int64 of the centroids. The first is point 0. Of equally far
+    points the one with the smallest x is taken. The result is nested: its first m indices are the
+    result for n = m. Raises ValueError unless 0 < n <= N.
 
     The trick: let r be the distance of the new centroid from the nearest earlier one. No point is
     farther from all earlier ones, so only points closer than r to the new one are affected. Sorted
@@ -180,7 +182,7 @@ def group_ball(xyz: np.ndarray, centroids: np.ndarray, r: float, n_n: int, tree=
 
     xyz (N,3) in metres, centroids (S,) indices into xyz -> (S,n_n) indices, nearest first. The
     first one is the centroid itself, or a point at the same place, so no ball is empty. The
-    centroid also fills the places of missing neighbours. These copies leave the maximum in eq. 3
+    centroid also fills the places of missing neighbours. Its copies leave the maximum in eq. 3
     unchanged but do affect the statistics of batch normalisation. tree: cKDTree(xyz), if known.
     """
     ranks = [*range(1, n_n + 1)]  # a list keeps the result two-dimensional for n_n = 1
@@ -200,7 +202,7 @@ def group_knn(xyz: np.ndarray, query: np.ndarray, k: int) -> np.ndarray:
 
 
 def record_dtype(config):
-    """The dtype of a scan's record: what the network needs of it, and facts about the scan."""
+    """The dtype of a record, one sampled scan: what the network needs of it, and facts about it."""
     n1, n2, n3 = config.sa1.n_fps, config.sa2.n_fps, config.sa3.n_fps
     return np.dtype([
         ("xyz", "f4", (n1, 3)),  # centroids of SA1; the first n2 are SA2's, the first n3 SA3's
@@ -218,8 +220,8 @@ def scan_records(scan: np.ndarray, config: Config = Config(), n: int = 1) -> np.
 
     scan: x, y, z [m] in the Velodyne frame, and intensity 0 to 1. Nothing is learned here, so a
     record is computed once for every scan and kept. Refinement uses n > 1: record k takes its
-    centroids from points k, k + n, k + 2n ..., so no two share a centroid; with too few points for
-    that, some records are equal. Raises ValueError if too few points are usable.
+    centroids from points k, k + n, k + 2n ..., so no two records share one. With fewer than n n1
+    points there are fewer different records. Raises ValueError if too few points are usable.
     """
     scan, invalid = kitti.usable_points(scan, config.max_range, config.plane)
     sa1, sa2, sa3 = config.sa1, config.sa2, config.sa3
@@ -234,7 +236,8 @@ def scan_records(scan: np.ndarray, config: Config = Config(), n: int = 1) -> np.
     records = np.zeros(n, record_dtype(config))
     for k, record in enumerate(records):
         part = k % parts
-        centroids = part + parts * farthest_point_sampling(cloud[part::parts], sa1.n_fps)  # (n1,)
+        centroids = farthest_point_sampling(cloud[part::parts], sa1.n_fps)  # (n1,)
+        centroids = part + parts * centroids  # indices into cloud
         neighbours = group_ball(cloud, centroids, sa1.r, sa1.n_n, tree)  # (n1,k1)
         record["xyz"] = xyz = cloud[centroids]  # (n1,3)
         record["group_sa1"][..., 0] = scan[neighbours, 3]  # (n1,k1)
@@ -269,12 +272,13 @@ def make_batch(records, p, q, config, device="cpu"):
 
 
 def neighbours_in_q(xyz, p, q, k):
-    """`group_knn` for every pair: centroids xyz (C,n,3) and index arrays p, q (B,) -> (B,n,k)."""
+    """`group_knn` for every pair: centroids xyz (C,n1,3) and index arrays p, q (B,) -> (B,n1,k)."""
     if xyz.device.type == "cpu":
         xyz = xyz.numpy()
         return torch.from_numpy(np.stack([group_knn(xyz[j], xyz[i], k) for i, j in zip(p, q)]))
-    # Elsewhere by a matrix of all distances, to avoid waiting for the CPU
-    distances = torch.cdist(xyz[p], xyz[q], compute_mode="donot_use_mm_for_euclid_dist")  # exact
+    # Elsewhere by a matrix of all distances, to avoid waiting for the CPU. (The mode of cdist that
+    # multiplies matrices is too inaccurate.)
+    distances = torch.cdist(xyz[p], xyz[q], compute_mode="donot_use_mm_for_euclid_dist")
     idx = distances.topk(min(k, xyz.shape[1]), largest=False).indices  # nearest first
     repeated = idx[..., :1].expand(-1, -1, k - idx.shape[2])
     return torch.cat([idx, repeated], 2)
@@ -295,7 +299,7 @@ def mlp_layers(c, widths):
 def gather(u, idx):
     """u (B,n,D), idx (B,S,k) -> (B,S,k,D): for every b the rows idx[b] of u[b]."""
     B, n, D = u.shape
-    rows = idx + n * torch.arange(B, device=u.device)[:, None, None]  # into u as (B n,D)
+    rows = idx + n * torch.arange(B, device=u.device)[:, None, None]  # of u reshaped to (B n,D)
     return u.reshape(B * n, D).index_select(0, rows.flatten()).view(*idx.shape, D)
 
 
@@ -311,18 +315,18 @@ class MiniPointNet(nn.Module):
         return self.after_first_layer(self.h[0](f))
 
     def over_neighbours(self, a, b, idx):
-        """max_i h(a_i + b_j) over the neighbours i of j: a (B,n,c), b (B,S,c), idx (B,S,k)
-        -> (B,S,c').
+        """max h(a_i + b_j) over the neighbours i of each j, given by idx (B,S,k).
 
-        The trick: h's first layer is linear, W (a_i + b_j) + w = W a_i + (W b_j + w). So it is
-        applied to n and S rows before the neighbours are gathered, not to S k rows after that.
+        a (B,n,c), b (B,S,c) -> (B,S,c'). The trick: h's first layer is linear, so
+        W (a_i + b_j) + w = W a_i + (W b_j + w). It is applied to n and S rows before the neighbours
+        are gathered, not to S k rows after that.
         """
         u = F.linear(a, self.h[0].weight)  # (B,n,c1)
         v = self.h[0](b)  # (B,S,c1)
         return self.after_first_layer(gather(u, idx).add_(v[:, :, None]))
 
     def after_first_layer(self, z):
-        """All layers of h but the first, and the maximum: z (...,k,c1) -> (...,c')."""
+        """The output z (...,k,c1) of h's first layer -> its other layers, maximum (...,c')."""
         points = z.flatten(0, -2)  # (points,c1): all points share the MLP
         for layer in self.h[1:-1]:
             points = F.relu_(points) if isinstance(layer, nn.ReLU) else layer(points)
@@ -338,7 +342,7 @@ class SetAbstraction(nn.Module):
         self.mpn = MiniPointNet(c + 3, layer.widths)
 
     def forward(self, x, f, idx):
-        """x (B,n,3), f (B,n,c), idx (B,S,k) -> f' (B,S,c'); centroids are the first S points."""
+        """x (B,n,3), f (B,n,c), idx (B,S,k) -> f' (B,S,c'). The first S points are centroids."""
         # [f_i, x_i - x'_j] = [f_i, x_i] + [0, -x'_j]
         a = torch.cat([f, x], -1)  # (B,n,c+3)
         b = F.pad(-x[:, :idx.shape[1]], (f.shape[2], 0))  # (B,S,c+3)
@@ -354,7 +358,7 @@ class FlowEmbedding(nn.Module):
 
     def forward(self, x, f, y, g, idx):
         """P: x (B,S,3), f (B,S,c); Q: y (B,n,3), g (B,n,c); idx (B,S,k) -> e (B,S,c')."""
-        # [f_i, g_j, y_j - x_i] = [0, g_j, y_j] + [f_i, 0, -x_i]; here the neighbours are j
+        # [f_i, g_j, y_j - x_i] = [0, g_j, y_j] + [f_i, 0, -x_i]; j is a neighbour of i
         a = torch.cat([torch.zeros_like(g), g, y], -1)  # (B,n,2c+3)
         b = torch.cat([f, torch.zeros_like(f), -x], -1)  # (B,S,2c+3)
         return self.mpn.over_neighbours(a, b, idx)
@@ -413,12 +417,12 @@ class MeanAbsoluteError(nn.Module):
 
 
 def training_batch(data, pairs, config, rng, device="cpu"):
-    """Load n pairs of scans for training -> Batch, and the motions T_pq (B,4,4) to predict.
+    """Load n pairs of scans -> Batch, and the motions T_pq (B,4,4) to predict.
 
     data: see `fit`; pairs: (n,2), the index s of the sequence and i of the scan P; Q is scan i + 1.
-    With augmentation, some pairs imitate refinement: Q may be several scans later, and is aligned
-    with P up to a small motion. Each pair is used in one random direction (B = n) or in both
-    (B = 2n).
+    Each pair is used in one random direction (B = n) or in both (B = 2n). With augmentation, some
+    pairs imitate refinement (part 6): Q may be several scans later, and is aligned with P up to a
+    small motion.
     """
     n = len(pairs)
     aligned = rng.random(n) < ALIGNED if config.augment else np.zeros(n, bool)
@@ -432,13 +436,12 @@ def training_batch(data, pairs, config, rng, device="cpu"):
     scans, T_pq = np.stack(scans_p + scans_q), np.stack(T_pq)  # all P, then all Q
     if config.augment:
         scans, T_pq = augment(scans, T_pq, aligned, rng)
-    p, q, T_qp = np.arange(n), np.arange(n, 2 * n), invert(T_pq)
-    if config.swap == "both":
-        p, q, T = np.r_[p, q], np.r_[q, p], np.concatenate([T_pq, T_qp])
-    else:  # section 4: swap P and Q at random, and invert the motion
-        swapped = rng.random(n) >= 0.5
-        p, q = np.where(swapped, q, p), np.where(swapped, p, q)
-        T = np.where(swapped[:, None, None], T_qp, T_pq)
+    p = np.arange(2 * n)  # both directions of each pair
+    q = (p + n) % (2 * n)
+    T = np.concatenate([T_pq, invert(T_pq)])
+    if config.swap == "random":  # section 4: swap P and Q at random, and invert the motion
+        chosen = np.arange(n) + n * rng.integers(2, size=n)
+        p, q, T = p[chosen], q[chosen], T[chosen]
     return make_batch(scans, p, q, config, device), T
 
 
@@ -448,11 +451,10 @@ def all_pairs(data):
 
 
 def steps_per_epoch(pairs, config):
-    """Number of batches in an epoch, in which each of `pairs` pairs occurs once.
+    """Number of batches in an epoch of `pairs` pairs: pairs // batch, at least 1.
 
-    A batch has `config.batch` pairs or more, but fewer than twice as many. If there are fewer pairs
-    in all, they form one batch. Raises ValueError if a batch would hold one pair in one direction:
-    the final MLP sees one row per pair, so batch normalisation would have no statistics.
+    Raises ValueError if a batch would hold one pair in one direction: the final MLP sees one row
+    per pair, so batch normalisation would have no statistics.
     """
     if config.swap == "random" and min(pairs, config.batch) < 2:
         raise ValueError(f"batch size {config.batch} with {pairs} training pairs: batch "
@@ -477,6 +479,8 @@ def batches(data, config, seed, start, stop, device="cpu"):
         rng = np.random.default_rng([*seed, epoch, part + 1])
         return training_batch(data, pairs[chosen], config, rng, device)
 
+    if start == stop:
+        return
     with ThreadPoolExecutor(1) as thread:
         following = thread.submit(prepare, start)
         for step in range(start, stop):
@@ -502,7 +506,9 @@ def make_optimizers(net, objective):
 
 
 def make_scheduler(optimizer, config, steps):
-    """Learning rate decays at epochs 300 and 400 of 500 (section 4), or PyTorch's one-cycle."""
+    """Learning rate decays at epochs 300 and 400 of 500 (section 4), or PyTorch's one-cycle, which
+    also cycles the momentum.
+    """
     if config.schedule == "one-cycle":
         return torch.optim.lr_scheduler.OneCycleLR(optimizer, config.lr, total_steps=steps)
     decays = [max(1, steps * 3 // 5), max(1, steps * 4 // 5)]  # 300/500 and 400/500
@@ -539,24 +545,26 @@ def fit(net, data, run, test=(), seed=0, device="cpu", objective=None, checkpoin
     facts: values to store with the weights, see `training_facts`.
 
     RUN/checkpoint.pt holds all that a step changes, and a batch depends on the seed and its number
-    alone. So a resumed run ends with the same weights, bit for bit. Raises ValueError if the loss,
-    a weight or a statistic is not finite; nothing is stored from then on.
+    alone. So on the same machine and with as many threads, a resumed run ends with the same
+    weights, bit for bit. Raises ValueError if the loss, a weight or a statistic is not finite;
+    nothing is stored from then on.
     """
     config, run, objective = net.config, Path(run), (objective or MeanAbsoluteError()).to(device)
     net.to(device)
     per_epoch = steps_per_epoch(len(all_pairs(data)), config)
     steps = config.epochs * per_epoch
-    frozen_from = round(steps * (1 - config.frozen))
-    optimizers = make_optimizers(net, objective)  # Adam with its default values
+    frozen_from = round(steps * (1 - config.frozen))  # from this step on, statistics are fixed
+    optimizers = make_optimizers(net, objective)
     schedulers = [make_scheduler(optimizer, config, steps) for optimizer in optimizers]
-    parts, step, losses = [net, objective, *optimizers, *schedulers], 0, []  # losses of this epoch
+    parts = [net, objective, *optimizers, *schedulers]  # all that a step changes
+    step, losses = 0, []  # losses of this epoch
     if checkpoint:
         with reading_weights(run / "checkpoint.pt"):
             step, losses = checkpoint["step"], checkpoint["losses"]
             for part, state in zip(parts, checkpoint["parts"], strict=True):
                 part.load_state_dict(state)
 
-    def update_statistics(net):  # takes the first element of each (Batch, T)
+    def update_statistics(net):  # with batches of their own: no epoch has the number 2**31
         update_bn(batches(data, config, (seed, 2**31), 0, min(25, steps), device), net)
 
     def inference_copy():  # running statistics lag behind the weights, so they are updated
@@ -568,7 +576,7 @@ def fit(net, data, run, test=(), seed=0, device="cpu", objective=None, checkpoin
     def require_finite(x, name):
         if not math.isfinite(x):
             raise ValueError(f"{run}: {name} became non-finite at step {step} (learning rate "
-                             f"{rate:.1e}); the last checkpoint, if any, was kept. Try a lower "
+                             f"{schedulers[0].get_last_lr()[0]:.1e}); the last checkpoint, if any, was kept. Try a lower "
                              "learning rate")
 
     def store(name, net, **content):
@@ -582,7 +590,7 @@ def fit(net, data, run, test=(), seed=0, device="cpu", objective=None, checkpoin
         if step == frozen_from:
             update_statistics(net)
         net.train(step < frozen_from)
-        rate = optimizers[0].param_groups[0]["lr"]
+        rate = schedulers[0].get_last_lr()[0]
         loss = loss_of(net, objective, batch, T)
         require_finite(loss.item(), "the loss")
         net.zero_grad()
@@ -665,10 +673,10 @@ def load_weights(path: str | Path | None = None, network=D3DLO):
             raise ValueError("it is a checkpoint, which only --resume can use")
         net = network(Config(**state["config"]))
         net.load_state_dict(state["model"])
-        numbers = np.array([*state["mean_motion"], *sum(state["seen"], [])], float)
-        names_are_sound = all(isinstance(x, str) for x in state["trained_on"])
-        if not (names_are_sound and np.isfinite(numbers).all()
-                and len(numbers) == 6 + 2 * len(kitti.STATS)):
+        (low, high), motion = state["seen"], state["mean_motion"]
+        if not (np.isfinite([*low, *high, *motion]).all() and len(motion) == 6
+                and len(low) == len(high) == len(kitti.STATS)
+                and all(isinstance(fingerprint, str) for fingerprint in state["trained_on"])):
             raise ValueError("damaged")
     return net.eval(), state
 
@@ -712,9 +720,8 @@ class Odometry:
     """Poses from a stream of scans: `Odometry().register(scan)`.
 
     weights: a weights file or the folder of a training run. None: the pretrained weights.
-    device: cpu, cuda or mps.
+    device: cpu, cuda or mps. network: the class of the network.
     refine: number of refinement passes, see `refine_pose`. 0: the paper's plain prediction.
-    network: the class of the network.
 
     Raises ValueError if an argument or the weights are invalid, and FileNotFoundError if there is
     no such weights file.
@@ -766,7 +773,7 @@ class Odometry:
         if self.refine and (not self.keyframe or is_far(invert(self.keyframe[1]) @ pose)):
             self.keyframe = records, pose
         self.last = records, pose
-        return pose.copy()
+        return pose.copy()  # the caller may change it
 
 
 def relative_pose(scan_p: np.ndarray, scan_q: np.ndarray, weights: str | Path | None = None,
@@ -863,13 +870,13 @@ def is_far(T):
 # 7  Evaluation: section 5
 
 BASELINES = "standing still", "mean training motion"
-LEGEND = """E_t, E_r: KITTI's segments of 100 to 800 m, rectified left camera frame. t step, r step:
-mean translation and rotation of inv(T_est) @ T_true per step, Velodyne frame. -: no such segment,
-or no ground truth."""
+LEGEND = """*: trained on, at least in part. E_t, E_r: KITTI's segments of 100 to 800 m, rectified
+left camera frame. t step, r step: mean translation and rotation of inv(T_est) @ T_true per step,
+Velodyne frame. -: no such segment, or no ground truth."""
 
 
 def record_of_file(scan_file, config):
-    """The record of a scan: (path, intensity_max) -> (). Raises ValueError, naming the file."""
+    """A tuple (path, intensity_max) -> the record of that scan. An error names the file."""
     path, intensity_max = scan_file
     scan = kitti.read_scan(path, intensity_max)
     try:
@@ -914,9 +921,9 @@ def predict_poses(odometry, s, records):
 
 
 def sequence_errors(s, poses, mean_motion):
-    """{predictor: (segment errors, step errors)} of estimated poses (n,4,4) and of the BASELINES.
+    """Estimated poses (n,4,4) -> {predictor: (segment errors (segments,), step errors (n-1,2))}.
 
-    Returns {} for a sequence without ground truth.
+    The predictors are "network" and the BASELINES. Returns {} without ground truth.
     """
     if s.poses is None:
         return {}
@@ -928,7 +935,7 @@ def sequence_errors(s, poses, mean_motion):
 
 
 def summarize(errors, trained_on):
-    """Average the errors per sequence, split and segment length, in the layout of results.json.
+    """Average the errors -> the dict of results.json: sequences, splits, pooled, lengths.
 
     errors: {sequence: result of `sequence_errors`}; trained_on: {sequence: bool}.
     """
@@ -948,13 +955,13 @@ def summarize(errors, trained_on):
 
 
 def results_table(results):
-    """Format the content of results.json as a table, followed by a line on units and frames."""
+    """Format the result of `summarize` as a table, followed by a legend of units and frames."""
     rows = [(name + " *" * s["trained_on"], s) for name, s in results["sequences"].items()]
     for name, s in [*results["splits"].items(), ("all", results["pooled"])]:
         rows.append((name + " *" * s["trained_on"], s))
         rows += [(f"  {predictor}", s[predictor]) for predictor in BASELINES]
     rows += results["lengths"].items()
-    return f"{metrics.table(rows)}\n*: trained on. {LEGEND}"
+    return f"{metrics.table(rows)}\n{LEGEND}"
 
 
 def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", refine=0, plot=False,
@@ -975,34 +982,35 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     odometry = Odometry(weights, device, refine, network)
     if plot:
         metrics.new_figure(1, 1)  # without matplotlib, fail now and not after the work
+    check_output(out, data or SIMULATED)
     sequences = sequences or ("all" if data else ("test", "validation"))
     root = data_root(data, sequences)
-    check_output(out, root)
     chosen = kitti.open_sequences(root, sequences)
     loaded = load_records(chosen, odometry.net.config)
     source = {"weights": str(weights or PRETRAINED), "data": str(root), "refine": refine}
     out = claim_output(out, "results", "results.json", source)
 
-    errors, trajectories, seen = {}, {}, odometry.facts["trained_on"]
+    errors, trained_on, trajectories = {}, {}, {}
     for s, records in progress(zip(chosen, loaded), len(chosen), "registering, sequences"):
         poses = predict_poses(odometry, s, records)
-        errors[s.name] = sequence_errors(s, poses, odometry.facts["mean_motion"])
-        if s.Tr is not None:
+        if s.Tr is None:  # a plain folder
+            metrics.write_poses(out / "poses.txt", poses)
+            kitti.write_tum(out / "poses.tum", poses, s.times)
+            results = {"path_m": metrics.path_lengths(poses)[-1], "scans": len(s)}
+            lines = [f"{s.folder}: {len(s)} scans, path of {results['path_m']:.1f} m",
+                     *(f"note          {note}" for note in s.notes),
+                     "frame         LiDAR at the first scan: x forward, y left, z up, in metres",
+                     f"trajectory    {out}/poses.txt (12 numbers a line, as in KITTI's pose files)",
+                     f"              {out}/poses.tum (t x y z qx qy qz qw, t in seconds)"]
+        else:
+            errors[s.name] = sequence_errors(s, poses, odometry.facts["mean_motion"])
+            # Sequences are compared by content, since different data may have the same name
+            trained_on[s.name] = s.fingerprint(records["crc"]) in odometry.facts["trained_on"]
             poses = kitti.velo_to_camera(poses, s.Tr)
-        metrics.write_poses(out / (f"{s.name}.txt" if s.Tr is not None else "poses.txt"), poses)
+            metrics.write_poses(out / f"{s.name}.txt", poses)
         trajectories[s.name] = s.poses_cam, poses
-    if s.Tr is None:
-        kitti.write_tum(out / "poses.tum", poses, s.times)
-        results = {"path_m": metrics.path_lengths(poses)[-1], "scans": len(s)}
-        lines = [f"{s.folder}: {len(s)} scans, path of {results['path_m']:.1f} m",
-                 *(f"note          {note}" for note in s.notes),
-                 "frame         LiDAR at the first scan: x forward, y left, z up, in metres",
-                 f"trajectory    {out}/poses.txt (12 numbers a line, as in KITTI's pose files)",
-                 f"              {out}/poses.tum (t x y z qx qy qz qw, t in seconds)"]
-    else:
-        # Sequences are compared by content, since different data may have the same name
-        results = summarize(errors, {s.name: s.fingerprint(records["crc"]) in seen
-                                     for s, records in zip(chosen, loaded)})
+    if errors:
+        results = summarize(errors, trained_on)
         lines = [results_table(results),
                  f"trajectories  {out}/NN.txt (KITTI pose files, rectified left camera frame)",
                  f"errors        {out}/results.json"]
@@ -1070,7 +1078,7 @@ def claim_output(out, kind, name, content):
 def data_root(data, names, whole=False):
     """The folder `data` or, if it is None, that of the simulated city.
 
-    Missing sequences of the city are simulated: those in `names`, or all if `whole`. Raises
+    Missing sequences of the city are simulated: those in `names`, or all if `whole` is true. Raises
     ValueError for a name that the city does not have.
     """
     if data:
@@ -1108,7 +1116,8 @@ def training_facts(fingerprints, motions, records, earlier):
     """What a weights file stores about its training data.
 
     fingerprints: of the sequences; motions, records: of each of them; earlier: the same facts about
-    earlier training data, if training starts from other weights, or {}.
+    earlier training data, if training starts from other weights, or {}. The mean motion is that of
+    the new data.
     """
     stats = [r["stats"] for r in records]
     stats = np.concatenate([*stats, np.reshape(earlier.get("seen", ()), (-1, len(kitti.STATS)))])
@@ -1125,13 +1134,11 @@ def read_run(run):
         data, sequences, seed, weights = (arguments[name] for name in
                                           ("data", "sequences", "seed", "weights"))
         check_number("seed", seed)
-        texts = [*sequences, *(path for path in (data, weights) if path is not None)]
-        if type(sequences) is not list or not all(isinstance(text, str) for text in texts):
-            raise ValueError("damaged")
+        data, weights = (path and str(Path(path)) for path in (data, weights))
+        return config, data, [str(Path(name)) for name in sequences], seed, weights
     except (ValueError, KeyError, TypeError, AttributeError, OSError):
         raise ValueError(f"{run}/config.json: missing or damaged, so there is no training run to "
                          "resume; give its folder with --out") from None
-    return config, data, sequences, seed, weights
 
 
 def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu", resume=False,
@@ -1222,9 +1229,8 @@ def command_line(argv):
     """
     settings = dict(formatter_class=argparse.RawDescriptionHelpFormatter,
                     argument_default=argparse.SUPPRESS)
-    parser = argparse.ArgumentParser(prog="d3dlo", **settings, description=(
-        "D3DLO: Deep 3D LiDAR Odometry. Train the network and evaluate it.\n"
-        "`train --help` and `eval --help` show all options, with examples."))
+    title, *_, examples = __doc__.split("\n\n")
+    parser = argparse.ArgumentParser(prog="d3dlo", description=f"{title}\n\n{examples}", **settings)
     parser.add_argument("--version", action="version", version=f"d3dlo {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="train | eval")
     both = argparse.ArgumentParser(add_help=False, argument_default=argparse.SUPPRESS)
@@ -1241,15 +1247,8 @@ def command_line(argv):
     add("--device", help="cpu, cuda or mps (default: cpu)")
     add("--out", metavar="DIR", help="new folder to write (default: runs/TIME or results/TIME)")
 
-    add = commands.add_parser(
-        "train", help="train, then evaluate on the test and validation splits", parents=[both],
-        **settings, description=(
-            "Train D3DLO, then evaluate it on the test and validation splits.\n\n"
-            "  python d3dlo.py train\n"
-            "  python d3dlo.py train --data ROOT\n"
-            "  python d3dlo.py train --data ROOT --sequences 00 01 --short --epochs 20\n"
-            "  python d3dlo.py train --data ROOT --weights d3dlo.pt --short --lr 0.002\n"
-            "  python d3dlo.py train --out RUN --resume")).add_argument
+    add = commands.add_parser("train", parents=[both], **settings, help=(
+        "train, then evaluate on the test and validation splits")).add_argument
     add("--short", action="store_true", help=(
         "our short recipe, the default without --data: few epochs, points within 50 m, both "
         "directions, Muon, one-cycle learning rate, augmentation, fixed BatchNorm statistics at "
@@ -1268,15 +1267,8 @@ def command_line(argv):
     add("--resume", action="store_true", help=(
         "continue the training run in --out with the options it was started with"))
 
-    add = commands.add_parser(
-        "eval", help="predict trajectories and print KITTI's errors", parents=[both], **settings,
-        description=(
-            "Predict the trajectories of sequences, write them and print KITTI's errors.\n"
-            "A plain folder of scans (*.bin or *.npy) gives a trajectory only.\n\n"
-            "  python d3dlo.py eval\n"
-            "  python d3dlo.py eval --data FOLDER --plot\n"
-            "  python d3dlo.py eval --data ROOT --sequences test\n"
-            "  python d3dlo.py eval --data ROOT --weights RUN --sequences 11 12")).add_argument
+    add = commands.add_parser("eval", parents=[both], **settings, help=(
+        "predict trajectories and print KITTI's errors")).add_argument
     add("--refine", type=int, metavar="N", help=(
         "not in the paper: refine each pose in N passes, each with its own sampling of the scan, "
         "the first against a keyframe, the others against the last scan; 3 is recommended "
@@ -1317,7 +1309,7 @@ def main(argv=None):
         else:
             train(config_from(args), **args)
     except KeyboardInterrupt as interrupt:
-        advice = str(interrupt) or "run the same command again"
+        advice = str(interrupt) or f"run it again{', with a new --out' * ('out' in args)}"
         print(f"\nd3dlo: interrupted; {advice}", file=sys.stderr)
         return 130
     except BrokenPipeError:

@@ -11,9 +11,9 @@ turns, so other work on the machine slows both. The table shows the median time 
 median and the range of baseline / here over the rounds. A pair-step is one pair of scans, in one
 direction, in one training step.
 
-With --against, the code in DIR is the baseline: this version or a later one, or commit b9e6db3. The
-environment is passed on, so OMP_WAIT_POLICY=PASSIVE, for example, can be tried. fpsample and
-kiss-icp are baselines if they are installed. Linux only. Run nothing else on the machine.
+With --against, the code in DIR is the baseline: of this version, of a later one, or of commit
+b9e6db3. fpsample and kiss-icp are baselines if they are installed. Children inherit the
+environment, so OMP_WAIT_POLICY=PASSIVE, for example, can be tried. Linux only.
 """
 import argparse
 import functools
@@ -25,10 +25,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -38,12 +36,13 @@ sys.path.insert(0, os.environ.get("D3DLO_CHECKOUT", str(HERE)))  # of a child: a
 import d3dlo
 import kitti
 
-SCANS, EPOCHS, WARM_UP = 33, 6, 2  # 32 pairs, in two batches an epoch; epochs not counted
+OLD = hasattr(d3dlo, "scan_geometry")  # commit b9e6db3
+SCANS, EPOCHS, WARM_UP = 33, 6, 2  # 32 pairs in two batches an epoch; epochs not counted
 CONFIG = d3dlo.Config(max_range=50.0, epochs=EPOCHS, batch=16, swap="both", augment=True)
 KITTI_PAIRS = 15960  # pairs of KITTI's training split
 
 # ------------------------------------------------------------------------------------------------
-# Measurements: functions of a `kitti.Sequence` and of a form, the name of a baseline or "here".
+# Measurements: functions of a `kitti.Sequence` and of a form, which is "here" or a baseline's name.
 # They return seconds.
 
 
@@ -70,15 +69,16 @@ def textbook_fps(xyz, n):
 
 def fps(s, form):
     """Farthest point sampling of 1,024 points of a scan."""
-    xyz, sample = np.ascontiguousarray(s.scan(len(s) // 2)[:, :3]), d3dlo.farthest_point_sampling
+    xyz = np.ascontiguousarray(s.scan(len(s) // 2)[:, :3])
     if form == "textbook loop":
-        sample = textbook_fps
-    elif form.startswith("fpsample"):
+        return seconds(lambda: textbook_fps(xyz, 1024))
+    if form == "fpsample exact":
         import fpsample
-        sample = {"fpsample exact": functools.partial(fpsample.fps_sampling, start_idx=0),
-                  "fpsample buckets": functools.partial(fpsample.bucket_fps_kdline_sampling, h=7,
-                                                        start_idx=0)}[form]
-    return seconds(lambda: sample(xyz, 1024))
+        return seconds(lambda: fpsample.fps_sampling(xyz, 1024, start_idx=0))
+    if form == "fpsample buckets":
+        import fpsample
+        return seconds(lambda: fpsample.bucket_fps_kdline_sampling(xyz, 1024, h=7, start_idx=0))
+    return seconds(lambda: d3dlo.farthest_point_sampling(xyz, 1024))
 
 
 def records(s, form, n=1):
@@ -91,11 +91,8 @@ def register(s, form, refine=0):
     """Registering a scan of a stream. The scans are in memory."""
     scans = [s.scan(i) for i in range(min(SCANS, len(s)))]
     if form == "KISS-ICP":
-        from classical import kiss_icp  # beside this file
-        icp = kiss_icp()
-
-        def work(scan):
-            icp.register_frame(scan[:, :3].astype(float), np.zeros(len(scan)))
+        from classical import KissIcp  # beside this file
+        work = KissIcp().register
     else:
         work = d3dlo.Odometry(refine=refine).register
     todo = iter(scans)
@@ -104,11 +101,10 @@ def register(s, form, refine=0):
 
 def prepare(s):
     """Records (n,) and motions (n-1,4,4) of the first scans."""
-    if hasattr(d3dlo, "scan_geometry"):  # commit b9e6db3
-        d3dlo.scan_records = lambda *args: d3dlo.scan_geometry(*args)[None]
-    n = min(SCANS, len(s))
-    sampled = [d3dlo.scan_records(s.scan(i), CONFIG) for i in range(n)]
-    return np.concatenate(sampled), s.motions()[:n - 1]
+    scans = [s.scan(i) for i in range(min(SCANS, len(s)))]
+    sampled = [d3dlo.scan_geometry(scan, CONFIG)[None] if OLD else d3dlo.scan_records(scan, CONFIG)
+               for scan in scans]
+    return np.concatenate(sampled), s.motions()[:len(scans) - 1]
 
 
 def training(s, form, frozen=0.0):
@@ -116,10 +112,8 @@ def training(s, form, frozen=0.0):
     if form != "default malloc":
         kitti.keep_freed_memory()
     records, motions = prepare(s)
+    data = ([records], [motions]) if OLD else ([(records, motions)],)
     net, times = d3dlo.D3DLO(replace(CONFIG, frozen=frozen)), []
-    data = [[(records, motions)]]
-    if hasattr(d3dlo, "scan_geometry"):  # commit b9e6db3
-        data = [records], [motions]
     with tempfile.TemporaryDirectory() as run:
         d3dlo.fit(net, *data, run, say=lambda line: times.append(time.perf_counter()))
     return np.median(np.diff(times[WARM_UP - 1:EPOCHS])) / (2 * len(motions))
@@ -129,8 +123,7 @@ def inference(s, form):
     """The network on one of 32 pairs in a batch. The records are given."""
     records, _ = prepare(s)
     p = np.arange(len(records) - 1)
-    batch = d3dlo.make_batch(records, p, p + 1, CONFIG)
-    net = d3dlo.D3DLO(CONFIG).eval()
+    batch, net = d3dlo.make_batch(records, p, p + 1, CONFIG), d3dlo.D3DLO(CONFIG).eval()
     with torch.inference_mode():
         return seconds(lambda: net(batch)) / len(p)
 
@@ -147,13 +140,12 @@ def cache(s, form):
 
 def startup(s, form):
     """Starting the command line and printing its help."""
-    command = ["-c", form] if form == "import torch" else [HERE / "d3dlo.py", "--help"]
-    return seconds(lambda: subprocess.run([sys.executable, *command], check=True,
-                                          capture_output=True), 3)
+    command = [sys.executable, *(["-c", form] if form != "here" else [HERE / "d3dlo.py", "-h"])]
+    return seconds(lambda: subprocess.run(command, check=True, capture_output=True), 3)
 
 
 def memory(s, form):
-    """Print the peak memory of training on as many pairs as KITTI's training split has.
+    """Peak memory of training on as many pairs as KITTI's training split has, a text.
 
     Trains for a few steps, then makes the batches of an epoch, which reads every record once.
     """
@@ -168,40 +160,30 @@ def memory(s, form):
         data = [(np.load(file, mmap_mode="r"), np.resize(motions, (KITTI_PAIRS, 4, 4)))]
         for _ in d3dlo.batches(data, CONFIG, (0,), 0, d3dlo.steps_per_epoch(KITTI_PAIRS, CONFIG)):
             pass
-        status = Path("/proc/self/status").read_text()
-        peak, own = (int(re.search(rf"{key}:\s*(\d+) kB", status)[1]) / 2**20
-                     for key in ("VmHWM", "RssAnon"))
-        return (f"training on {KITTI_PAIRS:,} pairs: peak {peak:.2f} GiB, {own:.2f} GiB of it "
-                f"without the pages of the cache, which has {file.stat().st_size / 2**30:.2f} GiB")
+        size, status = file.stat().st_size / 2**30, Path("/proc/self/status").read_text()
+    peak, own = (int(re.search(rf"{key}:\s*(\d+) kB", status)[1]) / 2**20
+                 for key in ("VmHWM", "RssAnon"))
+    return (f"training on {KITTI_PAIRS:,} pairs: peak {peak:.2f} GiB, {own:.2f} GiB of it without "
+            f"the pages of the cache, which has {size:.2f} GiB")
 
 
 # ------------------------------------------------------------------------------------------------
 # The table
 
-
-class Row(NamedTuple):
-    """A measurement, its name in the table, and its baselines."""
-
-    measure: Callable
-    work: str
-    baselines: tuple = ()
-
-
-ROWS = {
-    "fps": Row(fps, "FPS, 1,024 points of a scan",
-               ("textbook loop", "fpsample exact", "fpsample buckets")),
-    "records": Row(records, "sampling and grouping, a scan"),
-    "samplings": Row(functools.partial(records, n=3), "the same, three samplings"),
-    "register": Row(register, "Odometry.register, a scan", ("KISS-ICP",)),
-    "refine": Row(functools.partial(register, refine=3), "the same, refine=3", ("KISS-ICP",)),
-    "training": Row(training, "training, a pair-step in a batch of 32"),
-    "fixed": Row(functools.partial(training, frozen=0.999), "the same, fixed statistics"),
-    "inference": Row(inference, "network on a pair, records given"),
-    "cache": Row(cache, "sampling and grouping, a sequence", ("one worker",)),
-    "startup": Row(startup, "d3dlo.py --help", ("import torch",)),
-    "malloc": Row(training, "training, a pair-step in a batch of 32", ("default malloc",)),
-    "memory": Row(memory, "memory of training"),
-}
+ROWS = {  # measurement, its name in the table, baselines
+    "fps": (fps, "FPS, 1,024 points of a scan",
+            "textbook loop", "fpsample exact", "fpsample buckets"),
+    "records": (records, "sampling and grouping, a scan"),
+    "samplings": (functools.partial(records, n=3), "the same, three samplings"),
+    "register": (register, "Odometry.register, a scan", "KISS-ICP"),
+    "refine": (functools.partial(register, refine=3), "the same, refine=3", "KISS-ICP"),
+    "training": (training, "training, a pair-step in a batch of 32"),
+    "fixed": (functools.partial(training, frozen=0.999), "the same, fixed statistics"),
+    "inference": (inference, "network on a pair, records given"),
+    "cache": (cache, "sampling and grouping, a sequence", "one worker"),
+    "startup": (startup, "d3dlo.py --help", "import torch"),
+    "malloc": (training, "training, a pair-step in a batch of 32", "default malloc"),
+    "memory": (memory, "memory of training")}
 SLOW = "malloc", "memory"  # run only if named
 AGAINST = "fps", "register", "refine", "training", "fixed"  # rows that --against can compare
 PACKAGES = {"fpsample exact": "fpsample", "fpsample buckets": "fpsample", "KISS-ICP": "kiss_icp"}
@@ -217,32 +199,20 @@ def in_child(name, s, form, checkout):
     return done.stdout.strip()
 
 
-def child(name, form, root, sequence):
-    """Run in the process of `in_child`: measure and print the result."""
-    s, = kitti.open_sequences(root, [sequence])
-    print(ROWS[name].measure(s, form))
-
-
 def compare(name, s, rounds, against):
     """Measure a row. Prints a line of the table for each baseline, or one if there is none."""
-    baselines = [(form, HERE) for form in ROWS[name].baselines
-                 if form not in PACKAGES or importlib.util.find_spec(PACKAGES[form])]
+    _, work, *baselines = ROWS[name]
+    forms = [(form, HERE) for form in ("here", *baselines)
+             if form not in PACKAGES or importlib.util.find_spec(PACKAGES[form])]
     if against:
-        baselines = [("here", against)]
-    works = [("here", HERE), *baselines]
-    times = np.array([[float(in_child(name, s, *work)) for work in works] for _ in range(rounds)])
+        forms = [("here", HERE), ("here", against)]
+    times = np.array([[float(in_child(name, s, *form)) for form in forms] for _ in range(rounds)])
     here, *others = [f"{1000 * t:.3g} ms" if t < 1 else f"{t:.3g} s" for t in np.median(times, 0)]
-    if not baselines:
-        print(f"| {ROWS[name].work} | {here} | | | |", flush=True)
-    for (form, _), other, ratio in zip(baselines, others, (times[:, 1:] / times[:, :1]).T):
-        print(f"| {ROWS[name].work} | {here} | {against or form} {other} | {np.median(ratio):.2f} "
+    if not others:
+        print(f"| {work} | {here} | | | |", flush=True)
+    for (form, _), other, ratio in zip(forms[1:], others, (times[:, 1:] / times[:, :1]).T):
+        print(f"| {work} | {here} | {against or form} {other} | {np.median(ratio):.2f} "
               f"| {ratio.min():.2f} to {ratio.max():.2f} |", flush=True)
-
-
-def processor():
-    """The name of the processor."""
-    name = re.search(r"model name\s*: (.*)", Path("/proc/cpuinfo").read_text())
-    return name[1] if name else platform.processor()
 
 
 def start_busy_loops():
@@ -252,17 +222,15 @@ def start_busy_loops():
         subprocess.Popen([sys.executable, "-c", loop])
 
 
-def main():
-    """Run the command line."""
-    if sys.argv[1:2] == ["--child"]:
-        return child(*sys.argv[2:])
+def command_line():
+    """Parse the arguments."""
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("rows", nargs="*", metavar="ROW", help=(
         f"of {', '.join(ROWS)} (default: all but {' and '.join(SLOW)}, which take minutes)"))
     parser.add_argument("--data", metavar="ROOT", help=(
         "folder in KITTI odometry layout (default: simulated scans, made in data/bench)"))
-    parser.add_argument("--sequence", metavar="NN", help="default: the longest one")
+    parser.add_argument("--sequence", default="all", metavar="NN", help="default: the longest one")
     parser.add_argument("--rounds", type=int, default=5, metavar="N", help="default: 5")
     parser.add_argument("--busy", action="store_true", help="keep every core busy meanwhile")
     parser.add_argument("--against", type=Path, metavar="DIR", help=(
@@ -273,20 +241,30 @@ def main():
         parser.error(f"no such row: {', '.join(unknown)}; choose from {', '.join(known)}")
     if args.against and not (args.against / "d3dlo.py").is_file():
         parser.error(f"{args.against}: holds no d3dlo.py")
+    args.rows = args.rows or [name for name in known if name not in SLOW]
+    return args
+
+
+def main():
+    """Run the command line."""
+    if sys.argv[1:2] == ["--child"]:  # the process of `in_child`
+        name, form, root, sequence = sys.argv[2:]
+        return print(ROWS[name][0](*kitti.open_sequences(root, [sequence]), form))
+    args = command_line()
     try:
         root = args.data or kitti.simulate("data/bench", sequences=["00"], scans=100)
-        s = max(kitti.open_sequences(root, args.sequence or "all"), key=len)
-        if not len(s.motions()):  # ValueError without ground truth
-            raise ValueError(f"sequence {s.name} has one scan; two are needed")
+        s = max(kitti.open_sequences(root, args.sequence), key=len)
+        if len(s.motions()) < 4:  # ValueError without ground truth
+            raise ValueError(f"sequence {s.name} has {len(s)} scans, but 5 are needed")
     except (ValueError, OSError) as error:
-        parser.error(str(error))
-    print(f"{processor()}, {kitti.cores()} cores{', kept busy' * args.busy}, Python "
+        sys.exit(f"bench: {error}")
+    print(f"{kitti.cores()} cores of {platform.machine()}{', kept busy' * args.busy}, Python "
           f"{platform.python_version()}, torch {torch.__version__}, numpy {np.__version__}\n"
           f"sequence {s.name}, {len(s)} scans; {args.rounds} rounds\n\n"
           "| work | here | baseline | ratio, median | ratio, range |\n|---|---|---|---|---|")
     if args.busy:
         start_busy_loops()
-    for name in args.rows or [name for name in known if name not in SLOW]:
+    for name in args.rows:
         if name == "memory":
             print(in_child(name, s, "here", HERE))
         else:

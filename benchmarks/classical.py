@@ -1,4 +1,4 @@
-"""Poses and errors of KISS-ICP, a classical method, on the scans and with the metric of `eval`.
+"""How well does KISS-ICP, a classical method, do on the scans and with the metric of `eval`?
 
     pip install kiss-icp==1.3.0
     python benchmarks/classical.py ROOT OUT          # ROOT in KITTI odometry layout, with poses
@@ -20,53 +20,51 @@ import kitti
 import metrics
 
 
-def kiss_icp():
+class KissIcp:
     """KISS-ICP with its default settings, but for 1 m voxels and without deskewing.
 
     1 m is what it chooses itself for a range of 100 m. Deskewing needs the time of every point,
     which KITTI's odometry data do not have. Raises ValueError if the package is not installed.
     """
-    try:
-        from kiss_icp.config import KISSConfig
-        from kiss_icp.kiss_icp import KissICP
-    except ImportError:
-        raise ValueError("KISS-ICP is not installed: pip install kiss-icp==1.3.0") from None
-    config = KISSConfig()
-    config.data.deskew, config.data.max_range, config.mapping.voxel_size = False, 100.0, 1.0
-    return KissICP(config)
 
+    def __init__(self):
+        try:
+            from kiss_icp.config import KISSConfig
+            from kiss_icp.kiss_icp import KissICP
+        except ImportError:
+            raise ValueError("KISS-ICP is not installed: pip install kiss-icp==1.3.0") from None
+        config = KISSConfig()
+        config.data.deskew, config.data.max_range, config.mapping.voxel_size = False, 100.0, 1.0
+        self.icp, self.settings = KissICP(config), config.model_dump(exclude={"out_dir"})
 
-def register(s, icp):
-    """Poses T_0t (n,4,4) of all scans of a `kitti.Sequence`, Velodyne frame, by a new `icp`."""
-    poses = []
-    for i in kitti.progress(range(len(s)), len(s), f"registering {s.name}, scans"):
-        scan = s.scan(i)
-        icp.register_frame(scan[:, :3].astype(float), np.zeros(len(scan)))
-        poses.append(icp.last_pose)
-    return np.stack(poses)
+    def register(self, scan):
+        """Scan (N,4) -> its pose T_0t (4,4), Velodyne frame."""
+        self.icp.register_frame(scan[:, :3].astype(float), np.zeros(len(scan)))
+        return self.icp.last_pose
 
 
 def evaluate(root, names, out):
     """Write OUT/NN.txt and OUT/results.json for some sequences of `root`, and print the table."""
-    icp = kiss_icp()
+    settings = KissIcp().settings
     method = f"KISS-ICP {version('kiss-icp')}"
-    settings = icp.config.model_dump(exclude={"out_dir"})
     print(method, *(f"{part}: {values}" for part, values in settings.items()), sep="\n")
     errors, results = [], {}
     for s in kitti.open_sequences(root, names):
-        poses = register(s, kiss_icp())
+        s.motions()  # ValueError without ground truth
+        icp = KissIcp()
+        poses = np.stack([icp.register(s.scan(i)) for i in kitti.progress(
+            range(len(s)), len(s), f"registering {s.name}, scans")])  # (n,4,4)
         poses_cam = kitti.velo_to_camera(poses, s.Tr)
         metrics.write_poses(out / f"{s.name}.txt", poses_cam)
-        segments = metrics.segment_errors(s.poses_cam, poses_cam)
-        errors.append((segments, metrics.step_errors(s.poses, poses)))
-        results[s.name] = metrics.summary([segments], [errors[-1][1]])
+        errors.append((metrics.segment_errors(s.poses_cam, poses_cam),
+                       metrics.step_errors(s.poses, poses)))
+        results[s.name] = metrics.summary(*zip(errors[-1]))
     pooled = metrics.summary(*zip(*errors))
     metrics.write_json(out / "results.json", {
         "method": method, "settings": settings, "data": str(root), "sequences": results,
         "pooled": pooled})
-    rows = [metrics.row(name, s) for name, s in [*results.items(), ("all", pooled)]]
-    print(metrics.table(metrics.HEADER, rows), d3dlo.LEGEND, f"trajectories  {out}/NN.txt",
-          f"errors        {out}/results.json", sep="\n")
+    print(metrics.table([*results.items(), ("all", pooled)]), d3dlo.LEGEND,
+          f"trajectories  {out}/NN.txt", f"errors        {out}/results.json", sep="\n")
 
 
 def main():
@@ -80,7 +78,7 @@ def main():
     try:
         evaluate(args.root, args.sequences, args.out)
     except (ValueError, OSError) as error:
-        parser.error(str(error))
+        sys.exit(f"classical: {error}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Statistics of scans, to compare a simulation or another sensor with real drives.
+"""How much does a simulation, or another sensor, resemble real drives?
 
     python benchmarks/scan_stats.py ROOT [NN ...]  # folder in KITTI odometry layout, with poses
     python benchmarks/scan_stats.py data/full 00 01 02 08 09
@@ -39,7 +39,7 @@ RAISED = -1.2  # z of a raised centroid is above this [m]; the road is at -1.73 
 def pair_stats(scan_p, scan_q, T_pq, config):
     """Two scans and their true motion -> kitti.STATS (4,), the share of raised centroids, and for
     each of these its range, thickness, roundness and distance to the next scan (n,4)."""
-    record = d3dlo.scan_geometry(scan_p, config)
+    record, = d3dlo.scan_records(scan_p, config)
     xyz = record["xyz"].astype(float)
     raised = xyz[xyz[:, 2] > RAISED]  # (n,3)
     p, q = scan_p[:, :3].astype(float), scan_q[:, :3].astype(float)
@@ -58,18 +58,15 @@ def sequence_line(s, config):
     if not len(motions):
         raise ValueError(f"sequence {s.name} has one scan; two are needed")
     chosen = np.unique(np.linspace(0, len(motions) - 1, PAIRS).astype(int))
-    pairs = [pair_stats(s.scan(i), s.scan(i + 1), motions[i], config) for i in chosen]
-    stats, raised, rows = zip(*pairs)
+    stats, raised, rows = zip(*[pair_stats(s.scan(i), s.scan(i + 1), motions[i], config)
+                                for i in chosen])
     points, intensity, _, ground = np.mean(stats, 0)
-    line = (f"{s.name:<12}{points:6.0f}  {intensity:9.2f}  {ground:6.2f}  "
-            f"{np.mean(raised):6.2f}")
+    line = f"{s.name:<12}{points:6.0f}  {intensity:9.2f}  {ground:6.2f}  {np.mean(raised):6.2f}"
     rows = np.concatenate(rows)
     for low, high in zip(EDGES, EDGES[1:]):
-        _, thickness, roundness, distance = rows[(rows[:, 0] > low) & (rows[:, 0] <= high)].T
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # NaN when there is no such centroid
-            line += (f"{np.nanmedian(thickness):21.3f} {np.nanmean(roundness):5.2f} "
-                     f"{np.median(distance):4.2f}")
+        _, thick, roundness, following = rows[(rows[:, 0] > low) & (rows[:, 0] <= high)].T
+        line += (f"{np.nanmedian(thick):21.3f} {np.nanmean(roundness):5.2f} "
+                 f"{np.median(following):4.2f}")
     return line
 
 
@@ -80,13 +77,12 @@ def main():
     parser.add_argument("root", metavar="ROOT")
     parser.add_argument("names", nargs="*", metavar="NN", help="sequences (default: all)")
     args = parser.parse_args()
+    warnings.simplefilter("ignore", RuntimeWarning)  # a range without centroids gives NaN
     config = d3dlo.load_weights()[0].config
-    header = f"{'sequence':<12}points  intensity  ground  raised"
-    for low, high in zip(EDGES, EDGES[1:]):
-        header += f"   {low:2d} to {high} m: thick round next"
+    ranges = [f"   {low:2d} to {high} m: thick round next" for low, high in zip(EDGES, EDGES[1:])]
     try:
         sequences = kitti.open_sequences(args.root, args.names or "all")
-        print(header)
+        print(f"{'sequence':<12}points  intensity  ground  raised", *ranges, sep="")
         for s in sequences:
             print(sequence_line(s, config), flush=True)
     except (ValueError, OSError) as error:
