@@ -576,8 +576,8 @@ def fit(net, data, run, test=(), seed=0, device="cpu", objective=None, checkpoin
     def require_finite(x, name):
         if not math.isfinite(x):
             raise ValueError(f"{run}: {name} became non-finite at step {step} (learning rate "
-                             f"{schedulers[0].get_last_lr()[0]:.1e}); the last checkpoint, if any, was kept. Try a lower "
-                             "learning rate")
+                             f"{schedulers[0].get_last_lr()[0]:.1e}); the last checkpoint, if any, "
+                             "was kept. Try a lower learning rate")
 
     def store(name, net, **content):
         total = sum(tensor.double().sum().item() for tensor in net.state_dict().values())

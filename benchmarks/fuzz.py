@@ -1,23 +1,25 @@
-"""Feed damaged and malicious files to every reader.
+"""What does every reader do with damaged and malicious files?
 
     python benchmarks/fuzz.py  # 20,000 inputs, some minutes of one core
     python benchmarks/fuzz.py --inputs 500 --seed 7
 
-A valid file is truncated, emptied, overwritten with noise, spliced, given other numbers (NaN,
-infinite, huge) or other settings, or replaced by another kind of file, among them pickles that run
-code. A reader must return a valid result, or raise ValueError or OSError with a one-line message
-that names the file. A cache or weights that it accepts must equal those that were written. All else
-is a failure: another exception, an invalid result, more than 20 seconds, or code that was run.
+A valid file is truncated, overwritten with noise, spliced, given other numbers (NaN, infinite,
+huge) or other settings, or replaced by another kind of file, among them pickles that run code. A
+reader must return a valid result, or raise ValueError or OSError with a one-line message that names
+the file. Weights that it accepts must equal those that were written. A cache that NumPy cannot
+read, or of another dtype or length, must be computed again; other numbers inside it cannot be
+noticed. All else is a failure: another exception, an invalid result, more than 20 seconds, or code
+that was run.
 """
 import argparse
 import collections
 import contextlib
-import functools
 import io
 import json
 import math
 import os
 import pickle
+import shutil
 import sys
 import tempfile
 import time
@@ -36,9 +38,7 @@ from d3dlo import Config, Layer
 SMALL = Config(sa1=Layer(2.0, 32, 4, (4, 8)), fe=Layer(None, None, 4, (8, 16)),
                sa2=Layer(4.0, 16, 4, (16, 16)), sa3=Layer(8.0, 8, 4, (16, 16)),
                mpn=Layer(None, None, None, (16, 32)), mlp=Layer(None, None, None, (16, 6)),
-               max_range=50.0, plane=True)
-RECORD = d3dlo.geometry_dtype(SMALL)
-CACHE_ROW = np.dtype([("record", RECORD), ("scan_crc", "u4"), ("crc", "u4")])
+               max_range=50.0)
 WORDS = [b"nan", b"inf", b"-1e308", b"1e400", b"0", b"x", b"", b"\xff\xfe", b"9" * 400, b"\0",
          b"null", b"{}", b"1e-320", b"[", b"NaN"]
 FLOATS = [math.nan, math.inf, -math.inf, 3e38, 0, 1e-42]
@@ -47,8 +47,9 @@ VALUES = [None, True, -1, 0, 3, 0.5, math.nan, math.inf, 10**30, "", "x", "../x"
 NAME_PARTS = ["..", "/", "\\", "\0", "etc", "00", "~", " ", "\n", "C:", ".", "*", "é", "%00",
               "x" * 300]
 
-
+# ------------------------------------------------------------------------------------------------
 # Inputs
+
 
 class Bomb:
     """Makes a folder when it is unpickled."""
@@ -66,17 +67,7 @@ def malicious_files():
     return [pickle.dumps(Bomb()), saved.getvalue(), array.getvalue(), zeros.getvalue()]
 
 
-def truncate(rng, good, others):
-    """Keep only the start of the file, or nothing."""
-    return good[:rng.integers(len(good))] if rng.random() < 0.5 else b""
-
-
-def noise(rng, good, others):
-    """Replace the file by random bytes."""
-    return rng.bytes(int(rng.integers(1, 5000)))
-
-
-def flip_bits(rng, good, others):
+def flip_bits(rng, good):
     """Flip up to 20 bits."""
     data = bytearray(good)
     for i in rng.integers(len(data), size=rng.integers(1, 20)):
@@ -84,43 +75,33 @@ def flip_bits(rng, good, others):
     return bytes(data)
 
 
-def overwrite(rng, good, others):
+def overwrite(rng, good):
     """Overwrite a part with random bytes, or insert them."""
     at, n = rng.integers(len(good) + 1), int(rng.integers(1, 200))
     return good[:at] + rng.bytes(n) + good[at + n * rng.integers(2):]
 
 
-def replace_word(rng, good, others):
+def replace_word(rng, good):
     """Replace a word in a text."""
     words = good.split(b" ")
     words[rng.integers(len(words))] = WORDS[rng.integers(len(WORDS))]
     return b" ".join(words)
 
 
-def replace_floats(rng, good, others):
+def replace_floats(rng, good):
     """Replace numbers in a binary file of float32."""
     values = np.frombuffer(good[:len(good) // 4 * 4], "<f4").copy()
     values[rng.integers(len(values), size=rng.integers(1, len(values) + 1))] = rng.choice(FLOATS)
     return values.tobytes()
 
 
-def repeat(rng, good, others):
-    """Repeat the content two or three times."""
-    return good * int(rng.integers(2, 4))
-
-
-def other_file(rng, good, others):
-    """Replace the file by one of another kind."""
-    return others[rng.integers(len(others))]
-
-
-def shuffle_lines(rng, good, others):
+def shuffle_lines(rng, good):
     """Drop, repeat and reorder lines."""
     lines = good.splitlines(keepends=True)
     return b"".join(lines[i] for i in rng.integers(len(lines), size=rng.integers(len(lines) + 1)))
 
 
-def replace_setting(rng, good, others):
+def replace_setting(rng, good):
     """Replace a value in JSON or in a weights file. Other files are not changed."""
     if good.startswith(b"{"):
         return json.dumps(replace_value(rng, json.loads(good))).encode()
@@ -141,32 +122,61 @@ def replace_value(rng, tree):
     return tree
 
 
-MUTATIONS = [truncate, noise, flip_bits, overwrite, replace_word, replace_floats, repeat,
-             other_file, shuffle_lines, replace_setting]
+CHANGES = {
+    "empty": lambda rng, good: b"",
+    "truncate": lambda rng, good: good[:rng.integers(len(good))],
+    "noise": lambda rng, good: rng.bytes(int(rng.integers(1, 5000))),
+    "repeat": lambda rng, good: good * int(rng.integers(2, 4)),
+    **{function.__name__: function for function in (
+        flip_bits, overwrite, replace_word, replace_floats, shuffle_lines, replace_setting)}}
 
-
+# ------------------------------------------------------------------------------------------------
 # Readers: each has a valid file, a function that reads it, and a check of the result
+
 
 def finite(array, *shape):
     """Whether an array has the shape (None: any length) and finite numbers."""
+    array = np.asarray(array)
     fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape))
     return fits and array.dtype.kind in "iuf" and bool(np.isfinite(array).all())
 
 
-def read_record(path):
-    """A scan file -> the record that the cache keeps of it."""
-    compute = functools.partial(d3dlo.scan_geometry, config=SMALL)
-    row = kitti._cache_row((path, 1), compute, CACHE_ROW)
-    return np.frombuffer(row, CACHE_ROW)["record"][0]
+def write_raw_drive(folder):
+    """Write a drive of KITTI's raw data with two scans. Returns its folder."""
+    drive = folder / "2011_09_26_drive_0001_sync"
+    packet = b"49.0 8.4 112.0 0.03 0.01 1.5 -1.0 8.0 9.0" + b" 0.1" * 21
+    for stream, suffix, content in (("velodyne_points", "bin", bytes(160)), ("oxts", "txt", packet)):
+        (drive / stream / "data").mkdir(parents=True)
+        for i in range(2):
+            (drive / stream / "data" / f"{i:010d}.{suffix}").write_bytes(content)
+        (drive / stream / "timestamps.txt").write_text(
+            "2011-09-26 13:02:25.95\n2011-09-26 13:02:26.05\n")
+    for name, row in (("cam_to_cam", "R_rect_00"), ("velo_to_cam", "R"), ("imu_to_velo", "R")):
+        (folder / f"calib_{name}.txt").write_text(f"{row}: 1 0 0 0 1 0 0 0 1\nT: 0 0 0\n")
+    return drive
 
 
-def read_cache(path):
-    """A cache file -> its rows. ValueError with the message of `cached_records` when damaged."""
-    with contextlib.redirect_stderr(io.StringIO()) as message:
-        intact = kitti._is_intact(path, CACHE_ROW, 3)
-    if not intact:
-        raise ValueError(message.getvalue().strip())
-    return np.load(path)
+def read_raw(drive):
+    """Convert a raw drive -> the poses of its scans."""
+    shutil.rmtree("converted", ignore_errors=True)
+    names = list(kitti.convert_raw(drive, "converted"))
+    return np.concatenate([s.poses for s in kitti.open_sequences("converted", names)])
+
+
+def read_cache(s, path):
+    """Load the records of a sequence -> the records, and whether the file was computed again."""
+    found = path.read_bytes()
+    with contextlib.redirect_stderr(io.StringIO()):
+        records, = d3dlo.load_records([s], SMALL)
+    return records, path.read_bytes() != found
+
+
+def valid_weights(result, model):
+    """Whether loaded weights equal those of `model`, and the facts beside them are sound."""
+    net, state = result
+    return (all(torch.equal(tensor, model[name]) for name, tensor in net.state_dict().items())
+            and all(isinstance(fingerprint, str) for fingerprint in state["trained_on"])
+            and finite(state["seen"], 2, len(kitti.STATS)) and finite(state["mean_motion"], 6))
 
 
 def valid_run(run):
@@ -178,51 +188,58 @@ def valid_run(run):
             and isinstance(seed, int) and seed >= 0)
 
 
-def make_readers(folder, rng):
+def make_readers(rng):
     """Write a valid file of each kind -> {reader: (its path, read, check)}."""
     scan = np.c_[rng.uniform(-20, 20, (400, 3)), rng.random(400)].astype(np.float32)
-    scan.tofile(folder / "000000.bin")
-    poses = d3dlo.accumulate(kitti.from_vector(rng.normal(size=(9, 6))))
-    metrics.write_poses(folder / "poses.txt", poses)
-    (folder / "calib.txt").write_text(kitti._calibration()[1])
-    compute = functools.partial(d3dlo.scan_geometry, config=SMALL)
-    row = kitti._cache_row((folder / "000000.bin", 1), compute, CACHE_ROW)
-    rows = np.frombuffer(row * 3, CACHE_ROW)
-    np.save(folder / "cache.npy", rows)
+    scan.tofile("scan.bin")
+    np.save("scan.npy", scan)
+    for folder in ("plain", "timed", "raw"):
+        Path(folder).mkdir()
+        np.save(f"{folder}/0.npy", scan)
+    Path("timed/times.txt").write_text("1.5\n")
+    metrics.write_poses("poses.txt", d3dlo.accumulate(kitti.from_vector(rng.normal(size=(9, 6)))))
+    Path("calib.txt").write_text("P0: 1 2 3\nTr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n")
     arguments = dict(data=None, sequences=["00"], seed=0, device="cpu", weights=None)
-    d3dlo.write_run(folder, arguments, SMALL)
+    metrics.write_json("config.json", {"arguments": arguments, "config": SMALL.as_dict()})
     model = d3dlo.D3DLO(SMALL).state_dict()
-    d3dlo.save(folder / "weights.pt", model=model, config=SMALL.as_dict(), step=1,
-               train={"00": "0" * 16}, before=["1" * 16], mean_motion=[0.0] * 6,
-               seen=[[1.0] * len(kitti.STATS)] * 2)
+    d3dlo.save("weights.pt", model=model, config=SMALL.as_dict(), step=1, trained_on=["0" * 16],
+               mean_motion=[0.0] * 6, seen=[[1.0] * len(kitti.STATS)] * 2)
+    s, drive = kitti.Sequence("plain"), write_raw_drive(Path("raw"))
+    good = np.array(d3dlo.load_records([s], SMALL)[0])
+    cache, = Path("cache").iterdir()
 
-    def valid_weights(result):
-        net, state = result
-        fingerprints = [*state["train"].values(), *state["before"]]
-        return (all(torch.equal(tensor, model[name]) for name, tensor in net.state_dict().items())
-                and all(isinstance(fingerprint, str) for fingerprint in fingerprints)
-                and finite(np.array(state["seen"]), 2, len(kitti.STATS))
-                and finite(np.array(state["mean_motion"]), 6))
+    def valid_cache(result):
+        records, again = result
+        return ((records.dtype, records.shape) == (good.dtype, good.shape)
+                and (not again or records.tobytes() == good.tobytes()))
 
-    readers = {
-        "scan": ("000000.bin", kitti.read_scan, lambda scan: scan.shape[1:] == (4,)),
-        "geometry": ("000000.bin", read_record, lambda record: (
-            finite(record["xyz"], 32, 3) and finite(record["group_sa1"], 32, 4, 4))),
-        "poses": ("poses.txt", metrics.read_poses, lambda T: finite(T, None, 4, 4)),
+    def valid_poses(T):
+        return finite(T, None, 4, 4)
+
+    return {
+        "scan.bin": ("scan.bin", kitti.read_scan, lambda scan: scan.shape[1:] == (4,)),
+        "scan.npy": ("scan.npy", kitti.read_scan, lambda scan: scan.shape[1:] == (4,)),
+        "record": ("scan.bin", lambda path: d3dlo.record_of_file((path, 1), SMALL),
+                   lambda record: finite(record["group_sa1"], 32, 4, 4)),
+        "cache": (cache, lambda path: read_cache(s, path), valid_cache),
+        "times": ("timed/times.txt", lambda path: kitti.Sequence("timed").times,
+                  lambda times: finite(times, 1)),
+        "poses": ("poses.txt", metrics.read_poses, valid_poses),
         "calibration": ("calib.txt", kitti.read_calib, lambda T: finite(T, 4, 4)),
-        "weights": ("weights.pt", d3dlo.load_weights, valid_weights),
-        "cache": ("cache.npy", read_cache, lambda read: read.tobytes() == rows.tobytes()),
+        "weights": ("weights.pt", d3dlo.load_weights, lambda read: valid_weights(read, model)),
         "run": ("config.json", lambda path: d3dlo.read_run(path.parent), valid_run),
-    }
-    return {name: (folder / file, *rest) for name, (file, *rest) in readers.items()}
+        "raw times": (drive / "oxts/timestamps.txt", lambda path: read_raw(drive), valid_poses),
+        "raw packet": (drive / "oxts/data/0000000001.txt", lambda path: read_raw(drive),
+                       valid_poses),
+        "raw calibration": ("raw/calib_velo_to_cam.txt", lambda path: read_raw(drive),
+                            valid_poses)}
 
 
 def outcome_of(read, source, check, named):
     """Return "right", "refused", or what went wrong. named: whether a message names the source."""
     began = time.monotonic()
     try:
-        result = read(source)
-        outcome = "right" if check(result) else "an invalid result"
+        outcome = "right" if check(read(source)) else "an invalid result"
     except (ValueError, OSError) as error:
         outcome = "refused" if named(str(error)) else f"not one line with its name: {error!r:.300}"
     except Exception as error:
@@ -233,23 +250,50 @@ def outcome_of(read, source, check, named):
     return outcome if time.monotonic() - began < 20 else "more than 20 s"
 
 
-def try_file(reader, mutation, rng, others):
-    """Read a mutated file. Returns the outcome and the bytes that were read."""
-    path, read, check = reader
+def try_file(path, read, check, change, rng):
+    """Read a changed file. Returns the outcome and the bytes that were read."""
+    path = Path(path)
     good = path.read_bytes()
-    data = mutation(rng, good, others)
+    data = change(rng, good)
     path.write_bytes(data)
-    outcome = outcome_of(read, path, check, lambda line: path.name in line and "\n" not in line)
+    outcome = outcome_of(read, path, check, lambda line: "\n" not in line and (
+        path.name in line or "drive_0001" in line))  # some refusals concern the whole raw drive
     path.write_bytes(good)
     return outcome, data
 
 
-def try_name(root, rng):
+def try_name(rng):
     """Open a sequence by a random, possibly dangerous name. Returns the outcome and the name."""
     name = "".join(rng.choice(NAME_PARTS, rng.integers(1, 6)))
-    return outcome_of(lambda name: kitti.open_sequences(root, [name]), name,
+    return outcome_of(lambda name: kitti.open_sequences("root", [name]), name,
                       lambda sequences: [s.name for s in sequences] == ["00"],
                       lambda line: name in line or repr(name)[1:-1] in line), name
+
+
+def run(inputs, seed):
+    """Try a number of inputs. Prints the failures and a summary; returns the number of failures."""
+    rng, counts = np.random.default_rng(seed), collections.Counter()
+    readers = make_readers(rng)
+    for name, (path, read, check) in readers.items():
+        assert check(read(Path(path))), name
+    others = [Path(path).read_bytes() for path, *_ in readers.values()] + malicious_files()
+    changes = CHANGES | {"another file": lambda rng, good: others[rng.integers(len(others))]}
+    kitti.simulate("root", sequences=["00"], scans=1, azimuth=100)
+    kinds = [*readers, "sequence name"]
+    for i in kitti.progress(range(inputs), inputs, "inputs"):
+        kind, change = kinds[i % len(kinds)], rng.choice([*changes])
+        outcome, data = (try_file(*readers[kind], changes[change], rng) if kind in readers
+                         else try_name(rng))
+        if outcome not in ("right", "refused"):
+            print(f"input {i}, {kind}, {change}: {outcome}; {len(data)} bytes, {data[:200]!r}",
+                  flush=True)
+            outcome = "failed"
+        counts[kind, outcome] += 1
+    for (kind, outcome), n in sorted(counts.items()):
+        print(f"{kind}: {n:,} {outcome}")
+    failures = sum(n for (_, outcome), n in counts.items() if outcome == "failed")
+    print(f"{inputs:,} inputs (seed {seed}), {failures} failures")
+    return failures
 
 
 def main():
@@ -261,33 +305,12 @@ def main():
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="default: 0")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    rng, counts, failures = np.random.default_rng(args.seed), collections.Counter(), 0
+    # A worker process for every damaged cache would take most of the time
+    kitti.in_processes = lambda compute, tasks: (compute(task) for task in tasks)
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
-        readers = make_readers(Path(folder), rng)
-        for name, (path, read, check) in readers.items():
-            assert check(read(path)), name
-        others = [path.read_bytes() for path, *_ in readers.values()] + malicious_files()
-        kitti.simulate("root", sequences=("00",), scans=1, azimuth=100)
-        kinds = [*readers, "sequence name"]
-        for i in kitti.progress(range(args.inputs), args.inputs, "inputs"):
-            kind = kinds[i % len(kinds)]
-            mutation = MUTATIONS[rng.integers(len(MUTATIONS))]
-            if kind in readers:
-                outcome, data = try_file(readers[kind], mutation, rng, others)
-            else:
-                outcome, data = try_name("root", rng)
-            if outcome not in ("right", "refused"):
-                failures += 1
-                change = f", {mutation.__name__}" if kind in readers else ""
-                print(f"input {i}, {kind}{change}: {outcome}; {len(data)} bytes, {data[:200]!r}",
-                      flush=True)
-                outcome = "failed"
-            counts[kind, outcome] += 1
+        failures = run(args.inputs, args.seed)
         os.chdir("/")
-    for (kind, outcome), n in sorted(counts.items()):
-        print(f"{kind}: {n:,} {outcome}")
-    print(f"{args.inputs:,} inputs (seed {args.seed}), {failures} failures")
     return failures > 0
 
 

@@ -5,7 +5,7 @@
 
 An interruption is kill -9, SIGTERM, Ctrl-C or a write that fails, as on a full disk. It comes at a
 random moment: during start-up, while the cache is built (it is sometimes deleted), or while a
-checkpoint or weights are written, which happens every half second here. After each interruption
+checkpoint is written, which happens every half second here. After each interruption
 every file of the run must be missing or complete. At the end two training runs start at once
 without a cache; their files are read all the time.
 
@@ -39,7 +39,7 @@ sys.path.insert(0, {str(HERE)!r})
 import d3dlo, torch
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    d3dlo.CHECKPOINT_EVERY = d3dlo.WEIGHTS_EVERY = 0.5
+    d3dlo.CHECKPOINT_EVERY, d3dlo.WEIGHTS_EVERY = 0.5, 3
     if limit := int(sys.argv[1]):
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
     sys.exit(d3dlo.main(["train", *sys.argv[2:]]))
@@ -51,7 +51,7 @@ def start(run, limit=0):
     does."""
     options = ["--resume"]
     if not (run / "config.json").exists():
-        options = ["--data", "drives", "--short", "--batch", "4", "--epochs", "20"]
+        options = ["--data", "drives", "--short", "--batch", "4", "--epochs", "10"]
     command = [sys.executable, "-c", CHILD, str(limit), "--out", str(run), *options]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
                             start_new_session=True)
