@@ -145,26 +145,12 @@ def startup(s, form):
 
 
 def memory(s, form):
-    """Peak memory of training on as many pairs as KITTI's training split has, a text.
-
-    Trains for a few steps, then makes the batches of an epoch, which reads every record once.
-    """
+    """Peak memory of a training run, without the pages of its cache, a text."""
     training(s, form)
-    records, motions = prepare(s)
-    with tempfile.TemporaryDirectory(dir=".") as folder:
-        file = Path(folder, "kitti.npy")
-        cached = np.lib.format.open_memmap(file, "w+", records.dtype, (KITTI_PAIRS + 1,))
-        for i in range(0, len(cached), len(records)):
-            cached[i:i + len(records)] = records[:len(cached) - i]
-        del cached
-        data = [(np.load(file, mmap_mode="r"), np.resize(motions, (KITTI_PAIRS, 4, 4)))]
-        for _ in d3dlo.batches(data, CONFIG, (0,), 0, d3dlo.steps_per_epoch(KITTI_PAIRS, CONFIG)):
-            pass
-        size, status = file.stat().st_size / 2**30, Path("/proc/self/status").read_text()
-    peak, own = (int(re.search(rf"{key}:\s*(\d+) kB", status)[1]) / 2**20
-                 for key in ("VmHWM", "RssAnon"))
-    return (f"training on {KITTI_PAIRS:,} pairs: peak {peak:.2f} GiB, {own:.2f} GiB of it without "
-            f"the pages of the cache, which has {size:.2f} GiB")
+    peak = int(re.search(r"VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text())[1])
+    cache = (KITTI_PAIRS + 1) * d3dlo.record_dtype(CONFIG).itemsize
+    return (f"training: {peak / 2**20:.2f} GiB, and up to {cache / 2**30:.2f} GiB for the pages of "
+            "the cache of KITTI's training split")
 
 
 # ------------------------------------------------------------------------------------------------
@@ -184,7 +170,7 @@ ROWS = {  # measurement, its name in the table, baselines
     "startup": (startup, "d3dlo.py --help", "import torch"),
     "malloc": (training, "training, a pair-step in a batch of 32", "default malloc"),
     "memory": (memory, "memory of training")}
-SLOW = "malloc", "memory"  # run only if named
+ON_REQUEST = "malloc", "memory"
 AGAINST = "fps", "register", "refine", "training", "fixed"  # rows that --against can compare
 PACKAGES = {"fpsample exact": "fpsample", "fpsample buckets": "fpsample", "KISS-ICP": "kiss_icp"}
 
@@ -227,7 +213,7 @@ def command_line():
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("rows", nargs="*", metavar="ROW", help=(
-        f"of {', '.join(ROWS)} (default: all but {' and '.join(SLOW)}, which take minutes)"))
+        f"of {', '.join(ROWS)} (default: all but {' and '.join(ON_REQUEST)})"))
     parser.add_argument("--data", metavar="ROOT", help=(
         "folder in KITTI odometry layout (default: simulated scans, made in data/bench)"))
     parser.add_argument("--sequence", default="all", metavar="NN", help="default: the longest one")
@@ -241,7 +227,7 @@ def command_line():
         parser.error(f"no such row: {', '.join(unknown)}; choose from {', '.join(known)}")
     if args.against and not (args.against / "d3dlo.py").is_file():
         parser.error(f"{args.against}: holds no d3dlo.py")
-    args.rows = args.rows or [name for name in known if name not in SLOW]
+    args.rows = args.rows or [name for name in known if name not in ON_REQUEST]
     return args
 
 

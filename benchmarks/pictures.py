@@ -1,9 +1,8 @@
-"""Pictures for the documentation. Needs matplotlib: pip install ".[plot]"
+"""Draws the pictures of the documentation. Needs matplotlib: pip install ".[plot]"
 
-    python benchmarks/pictures.py network docs/network.png  # Fig. 1 with shapes and parameters
-    python benchmarks/pictures.py method docs/method.png  # sampling and grouping of two scans
-    python benchmarks/pictures.py method docs/method.png --data ROOT --sequence 00 --scan 100
-    python benchmarks/pictures.py curve docs/curve.png runs/A  # loss by epoch
+    python benchmarks/pictures.py network docs/network.png    # Fig. 1 with shapes and parameters
+    python benchmarks/pictures.py method docs/method.png data/simulated --sequences 03 --scan 60
+    python benchmarks/pictures.py curve docs/curve.png RUN    # loss by epoch of a training run
     python benchmarks/pictures.py table2 docs/table2.png runs/experiments
 
 Trajectories and errors come from two evaluations of the same data, plain and refined:
@@ -14,7 +13,7 @@ Trajectories and errors come from two evaluations of the same data, plain and re
 The errors of KISS-ICP on the same data come from benchmarks/classical.py:
 
     python benchmarks/classical.py ROOT K
-    python benchmarks/pictures.py steps docs/steps.png P R K  # real drives
+    python benchmarks/pictures.py steps docs/steps.png P R K    # real drives
 """
 import argparse
 import json
@@ -30,6 +29,10 @@ from experiments import PAPER_2, row_of_table_2
 import d3dlo
 import kitti
 import metrics
+
+COLOURS = {"truth": "0.6", "plain": "tab:orange", "refined": "tab:blue", "KISS-ICP": "tab:green"}
+# Error of a step [m] that comes from the noise of the ground truth, GPS/IMU; docs/results.md
+TRUTH_NOISE = {"drive0013": 0.015, "drive0005": 0.024}
 
 
 def scatter(axis, points, size, color, **style):
@@ -67,14 +70,13 @@ def draw_flow(axis, xyz_p, xyz_q, centroid, k):
     window(axis, centroid, half, f"FE: {k} neighbours in Q")
 
 
-def method(root, name, i):
+def method(root, sequences, i):
     """Draw the centroids of scan i, a ball of SA1 and of SA2, and a group of the flow embedding."""
-    config = d3dlo.load_weights()[0].config
-    s = kitti.Sequence(root, name)
+    config, s = d3dlo.load_weights()[0].config, kitti.open_sequences(root, sequences)[0]
     if not 0 <= i < len(s) - 1:
-        raise ValueError(f"sequence {name} has {len(s)} scans; --scan must be 0 to {len(s) - 2}")
+        raise ValueError(f"sequence {s.name} has {len(s)} scans; --scan must be 0 to {len(s) - 2}")
     scan = s.scan(i)
-    p, q = d3dlo.scan_geometry(scan, config), d3dlo.scan_geometry(s.scan(i + 1), config)
+    (p,), (q,) = d3dlo.scan_records(scan, config), d3dlo.scan_records(s.scan(i + 1), config)
     xyz, sa1, sa2 = p["xyz"], config.sa1, config.sa2
     ranges = np.linalg.norm(xyz[:sa2.n_fps, :2], axis=1)
     on_ground = xyz[:sa2.n_fps, 2] < -1
@@ -96,103 +98,92 @@ def method(root, name, i):
 
 def network():
     """Draw Fig. 1: the blocks with their outputs and parameters."""
-    net = d3dlo.D3DLO()
     parameters = {name: sum(p.numel() for p in block.parameters())
-                  for name, block in net.named_children()}
+                  for name, block in d3dlo.D3DLO().named_children()}
     figure = metrics.new_figure(11, 2.6)
     axis = figure.subplots()
     axis.set(xlim=(0, 11), ylim=(0, 2.6))
     axis.axis("off")
 
+    def write(x, y, text, size=9, **style):
+        axis.text(x, y, text, ha="center", va="center", fontsize=size, **style)
+
     def box(x, y, name, title):
-        axis.text(x, y, f"{title}\n{parameters[name]:,}", ha="center", va="center",
-                  bbox=dict(boxstyle="round,pad=0.4", fc="#dbe7f3", ec="#4a6d8c"))
+        write(x, y, f"{title}\n{parameters[name]:,}", 10,
+              bbox=dict(boxstyle="round,pad=0.4", fc="#dbe7f3", ec="#4a6d8c"))
 
-    def arrow(start, end, label=""):
+    def arrow(start, end, label):
         axis.annotate("", end, start, arrowprops=dict(arrowstyle="->", color="0.3"))
-        middle = np.mean([start, end], 0)
-        axis.text(middle[0], middle[1] + 0.14, label, ha="center", va="bottom", fontsize=8)
+        write(*np.mean([start, end], 0) + [0, 0.2], label, 8)
 
-    for y, scan in (2.1, "P"), (0.7, "Q"):
+    for y, end, scan in (2.1, 1.52, "P"), (0.7, 1.28, "Q"):
+        write(0.3, y, scan, 14)
         arrow((0.5, y), (1.65, y), "N x 4")
-        axis.text(0.3, y, scan, ha="center", va="center", fontsize=14)
         box(1.9, y, "sa1", "SA1")
-        arrow((2.2, y), (3.5, 1.4 + 0.12 * np.sign(y - 1.4)), "1,024 x 32")
-    axis.text(1.9, 1.4, "shared weights", ha="center", va="center", fontsize=8)
-    blocks = {"fe": "flow embedding", "sa2": "SA2", "sa3": "SA3", "mpn": "mini-PointNet",
-              "mlp": "MLP"}
-    places = dict(zip(blocks, (4.2, 5.95, 7.2, 8.65, 10.05)))
-    outputs = dict(zip(blocks, ("1,024 x 64", "256 x 64", "64 x 64", "256", "6")))
-    begins, ends = (4.95, 6.3, 7.55, 9.35, 10.35), (5.65, 6.9, 7.95, 9.75, 10.75)
-    for (name, title), begin, end in zip(blocks.items(), begins, ends):
-        box(places[name], 1.4, name, title)
-        arrow((begin, 1.4), (end, 1.4), outputs[name])
-    axis.text(5.5, 0.15, "In the boxes: parameters, "
-              f"{sum(parameters.values()):,} in all. At the arrows: points x features.\n"
-              "A point of a scan has x, y, z and intensity. The output is a translation in metres "
-              "and three angles in degrees.", ha="center", fontsize=9)
+        arrow((2.2, y), (3.5, end), "1,024 x 32")
+    write(1.9, 1.4, "shared weights", 8)
+    for x, name, title, begin, end, output in (
+            (4.2, "fe", "flow embedding", 4.95, 5.65, "1,024 x 64"),
+            (5.95, "sa2", "SA2", 6.3, 6.9, "256 x 64"),
+            (7.2, "sa3", "SA3", 7.55, 7.95, "64 x 64"),
+            (8.65, "mpn", "mini-PointNet", 9.35, 9.75, "256"),
+            (10.05, "mlp", "MLP", 10.35, 10.75, "6")):
+        box(x, 1.4, name, title)
+        arrow((begin, 1.4), (end, 1.4), output)
+    write(5.5, 0.25, "In the boxes: parameters, "
+          f"{sum(parameters.values()):,} in all. At the arrows: points x features.\n"
+          "A point of a scan has x, y, z and intensity. The output is a translation in metres "
+          "and three angles in degrees.")
     return figure
 
 
-COLOURS = {"truth": "0.6", "plain": "tab:orange", "refined": "tab:blue", "KISS-ICP": "tab:green"}
-
-
-def paths(root, plain, refined, names):
+def paths(root, plain, refined, sequences):
     """Draw the true and the predicted paths of sequences from above, all at the same scale."""
-    drives = []
-    for s in kitti.open_sequences(root, names):
-        simulated = (s.folder / "simulated.json").exists()
-        files = [folder / f"{s.name}.txt" for folder in (plain, refined)]
-        poses = dict(zip(COLOURS, [s.poses_cam, *map(metrics.read_poses, files)]))
-        drives.append(("simulated " * simulated + s.name, poses))
+    drives = kitti.open_sequences(root, sequences)
+    estimates = {label: [metrics.read_poses(folder / f"{s.name}.txt") for s in drives]
+                 for label, folder in (("plain", plain), ("refined", refined))}
     figure = metrics.new_figure(4.2 * len(drives), 4.6)
     axes = np.atleast_1d(figure.subplots(1, len(drives)))
-    points = [np.concatenate([T[:, :3, 3] for T in poses.values()]) for _, poses in drives]
-    half = 0.54 * max(np.ptp(xyz[:, [0, 2]], axis=0).max() for xyz in points)  # shared scale
-    for axis, (name, poses), xyz in zip(axes, drives, points):
-        truth = poses["truth"]
-        for label, T in poses.items():
+    for axis, s, *predicted in zip(axes, drives, *estimates.values()):
+        end = s.poses_cam[-1, :3, 3]
+        off = [np.linalg.norm(T[-1, :3, 3] - end) for T in predicted]
+        for label, T in zip(COLOURS, (s.poses_cam, *predicted)):
             axis.plot(T[:, 0, 3], T[:, 2, 3], color=COLOURS[label], label=label,
                       lw=4 if label == "truth" else 1.4)
         axis.plot(0, 0, "ko", ms=5)
-        drift = {label: np.linalg.norm((T - truth)[-1, :3, 3]) for label, T in poses.items()}
-        middle = (xyz.max(0) + xyz.min(0)) / 2
-        axis.set(title=f"{name}, {metrics.path_lengths(truth)[-1]:,.0f} m. Off at the end:\n"
-                 f"plain {drift['plain']:.1f} m, refined {drift['refined']:.1f} m",
-                 xlabel="to the right [m]", ylabel="forward [m]", aspect="equal",
-                 xlim=(middle[0] - half, middle[0] + half),
-                 ylim=(middle[2] - half, middle[2] + half))
+        simulated = "simulated " * (s.folder / "simulated.json").exists()
+        axis.set(title=f"{simulated}{s.name}, {metrics.path_lengths(s.poses_cam)[-1]:,.0f} m. "
+                 f"Off at the end:\nplain {off[0]:.1f} m, refined {off[1]:.1f} m",
+                 xlabel="to the right [m]", ylabel="forward [m]", aspect="equal")
         axis.grid(color="0.9")
+    limits = np.array([[axis.get_xlim(), axis.get_ylim()] for axis in axes])  # (drives,2,2)
+    half = np.ptp(limits, axis=2).max() / 2  # the same scale for all
+    for axis, (x, y) in zip(axes, limits.mean(2)):
+        axis.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
     axes[0].legend(frameon=False)
     return figure
-
-
-# Error of a step [m] that comes from the noise of the ground truth, GPS/IMU; docs/results.md
-TRUTH_NOISE = {"drive0013": 0.015, "drive0005": 0.024}
 
 
 def steps(plain, refined, classical):
     """Draw bars: the error per step on the real drives, plain, refined and of KISS-ICP."""
     folders = {"plain": plain, "refined": refined, "KISS-ICP": classical}
-    results = {label: json.loads((folder / "results.json").read_text())["sequences"]
+    results = {label: json.loads((folder / "results.json").read_text(encoding="utf-8"))["sequences"]
                for label, folder in folders.items()}
-    figure = metrics.new_figure(8, 3)
-    for axis, key, unit in zip(figure.subplots(1, 2), ("t_step_m", "r_step_deg"), ("cm", "deg")):
-        for i, label in enumerate(results):
-            heights = np.array([results[label][name][key] for name in TRUTH_NOISE])
-            heights *= 100 if unit == "cm" else 1
-            axis.bar(np.arange(2) + 0.27 * (i - 1), heights, 0.25, color=COLOURS[label],
-                     label=label)
-        labels = [name.replace("drive", "real drive ") for name in TRUTH_NOISE]
-        axis.set(xticks=range(2), xticklabels=labels, ylabel=f"mean error per step [{unit}]")
+    figure, x = metrics.new_figure(8, 3), np.arange(len(TRUTH_NOISE))
+    centimetres, degrees = figure.subplots(1, 2)
+    for axis, key, unit in (centimetres, "t_step_m", 100), (degrees, "r_step_deg", 1):
+        for i, (label, of_drive) in enumerate(results.items()):
+            heights = [unit * of_drive[name][key] for name in TRUTH_NOISE]
+            axis.bar(x + 0.27 * (i - 1), heights, 0.25, color=COLOURS[label], label=label)
+        axis.set_xticks(x, [name.replace("drive", "real drive ") for name in TRUTH_NOISE])
         axis.grid(axis="y", color="0.9")
         axis.set_axisbelow(True)
-        if unit == "cm":
-            for i, noise in enumerate(TRUTH_NOISE.values()):
-                axis.plot([i - 0.42, i + 0.42], [100 * noise] * 2, "k--", lw=1,
-                          label="noise of the ground truth" if i == 0 else None)
-            axis.set_ylim(0, 1.4 * axis.get_ylim()[1])  # room for the legend
-            axis.legend(frameon=False, fontsize=8, ncols=2)
+    noise = [100 * noise for noise in TRUTH_NOISE.values()]
+    centimetres.hlines(noise, x - 0.42, x + 0.42, "k", "--", lw=1,
+                       label="noise of the ground truth")
+    centimetres.set(ylabel="mean error per step [cm]", ylim=(0, 1.4 * centimetres.get_ylim()[1]))
+    centimetres.legend(frameon=False, fontsize=8, ncols=2)
+    degrees.set_ylabel("mean error per step [deg]")
     return figure
 
 
@@ -227,7 +218,8 @@ def table2(out):
         label = "with the plane" if plane else "without the plane"
         paper.plot(n_n, [PAPER_2[n, plane][0] for n in n_n], "o-", color=colour, label=label)
         for axis, key in ((ours, "E_t"), (steps, "t_step_m")):
-            each = [rows[row_of_table_2(n, plane, None)[0]]["all"][key] for n in n_n]  # (5,seeds)
+            each = np.array([rows[row_of_table_2(n, plane, None)[0]]["all"][key] for n in n_n],
+                            float)  # (5,seeds)
             axis.plot(n_n, np.mean(each, 1), "-", color=colour)
             axis.plot(n_n, each, "o", color=colour, markersize=4)
     paper.set(title="the paper, on KITTI", ylabel="E_t [%]")
@@ -242,55 +234,42 @@ def table2(out):
     return figure
 
 
-def main():
-    """Run the command line."""
+FOLDERS = {network: [], method: ["root"], paths: ["root", "plain", "refined"],
+           steps: ["plain", "refined", "classical"], curve: ["run"], table2: ["out"]}
+
+
+def command_line():
+    """Parse the arguments. Returns a function that draws, its arguments, and the file to write."""
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
-    m = commands.add_parser("method", help="sampling and grouping of two scans")
-    m.add_argument("picture", type=Path)
-    m.add_argument("--data", metavar="ROOT", help=(
-        "folder in KITTI odometry layout (default: the simulated city)"))
-    m.add_argument("--sequence", default="03", metavar="NN", help="default: 03")
-    m.add_argument("--scan", type=int, default=60, metavar="N", help="default: 60")
-    n = commands.add_parser("network", help="the network as in Fig. 1")
-    n.add_argument("picture", type=Path)
-    p = commands.add_parser("paths", help="true and predicted paths from above")
-    p.add_argument("picture", type=Path)
-    p.add_argument("data", metavar="ROOT", help="folder in KITTI odometry layout")
-    p.add_argument("--sequences", nargs="+", default=["all"], metavar="NN", help="default: all")
-    b = commands.add_parser("steps", help="error per step on the real drives")
-    b.add_argument("picture", type=Path)
-    for command in (p, b):
-        command.add_argument("plain", type=Path, metavar="P", help="folder written by eval")
-        command.add_argument("refined", type=Path, metavar="R", help="by eval --refine 3")
-    b.add_argument("classical", type=Path, metavar="K", help="folder written by classical.py")
-    c = commands.add_parser("curve", help="loss by epoch")
-    c.add_argument("picture", type=Path)
-    c.add_argument("run", type=Path, metavar="RUN", help="folder of a training run")
-    t = commands.add_parser("table2", help="the paper's Table 2 and ours")
-    t.add_argument("picture", type=Path)
-    t.add_argument("out", type=Path, metavar="OUT", help="folder written by experiments.py table2")
-    args = parser.parse_args()
+    for draw, folders in FOLDERS.items():
+        command = commands.add_parser(draw.__name__, description=draw.__doc__)
+        command.set_defaults(draw=draw)
+        command.add_argument("picture", type=Path, metavar="FILE", help="the picture to write, PNG")
+        for folder in folders:
+            command.add_argument(folder, type=Path, metavar=folder.upper())
+        if "root" in folders:
+            command.add_argument("--sequences", nargs="+", default="all", metavar="NN")
+        if draw is method:
+            command.add_argument("--scan", type=int, default=60, metavar="N", dest="i")
+    args = vars(parser.parse_args())
+    args.pop("command")
+    return args.pop("draw"), args.pop("picture"), args
+
+
+def main():
+    """Run the command line."""
+    draw, picture, args = command_line()
     try:
-        if args.command == "method":
-            root = args.data or kitti.simulate(d3dlo.SIMULATED, sequences=[args.sequence])
-            figure = method(root, args.sequence, args.scan)
-        elif args.command == "network":
-            figure = network()
-        elif args.command == "paths":
-            figure = paths(args.data, args.plain, args.refined, args.sequences)
-        elif args.command == "steps":
-            figure = steps(args.plain, args.refined, args.classical)
-        elif args.command == "table2":
-            figure = table2(args.out)
-        else:
-            figure = curve(args.run)
-        with metrics.replacing(args.picture) as temporary:
+        figure = draw(**args)
+        with metrics.replacing(picture) as temporary:
             figure.savefig(temporary, format="png", dpi=100)
     except (ValueError, OSError) as error:
-        parser.error(str(error))
-    print(args.picture)
+        sys.exit(f"pictures: {error}")
+    except KeyError as error:
+        sys.exit(f"pictures: a results.json or table2.json holds nothing about {error}")
+    print(picture)
 
 
 if __name__ == "__main__":
