@@ -225,11 +225,15 @@ def scan_records(scan: np.ndarray, config: Config = Config(), n: int = 1) -> np.
     """
     scan, invalid = kitti.usable_points(scan, config.max_range, config.plane)
     sa1, sa2, sa3 = config.sa1, config.sa2, config.sa3
-    if len(scan) < sa1.n_fps:
-        reach = config.max_range or kitti.MAX_VALID_RANGE
-        raise ValueError(f"{len(scan)} usable points (finite, within {reach:.0f} m"
-                         f"{'' if config.plane else ', off the ground'}), but the network needs "
-                         f"{sa1.n_fps}; are the coordinates in metres?")
+
+    def require_enough(points):
+        if points < sa1.n_fps:
+            reach = config.max_range or kitti.MAX_VALID_RANGE
+            raise ValueError(f"{points} different usable points (finite, within {reach:.0f} m"
+                             f"{'' if config.plane else ', off the ground'}), but the network "
+                             f"needs {sa1.n_fps}; are the coordinates in metres?")
+
+    require_enough(len(scan))
     cloud = np.ascontiguousarray(scan[:, :3])
     tree = cKDTree(cloud, leafsize=48, balanced_tree=False, compact_nodes=False)  # fast to build
     parts = min(n, len(cloud) // sa1.n_fps)
@@ -240,6 +244,7 @@ def scan_records(scan: np.ndarray, config: Config = Config(), n: int = 1) -> np.
         centroids = part + parts * centroids  # indices into cloud
         neighbours = group_ball(cloud, centroids, sa1.r, sa1.n_n, tree)  # (n1,k1)
         record["xyz"] = xyz = cloud[centroids]  # (n1,3)
+        require_enough(len(np.unique(xyz, axis=0)))
         record["group_sa1"][..., 0] = scan[neighbours, 3]  # (n1,k1)
         record["group_sa1"][..., 1:] = cloud[neighbours] - xyz[:, None]  # (n1,k1,3)
         # One sampling serves all layers. Farthest point sampling of SA1's centroids would choose
@@ -648,9 +653,18 @@ def reading_weights(path):
 
 def read_archive(path):
     """The content of a weights file or checkpoint, a dict. Code in the file is never run."""
-    if zipfile.ZipFile(path).testzip():  # torch does not verify the archive's checksums
+    archive = zipfile.ZipFile(path)
+    if any(entry.compress_type for entry in archive.infolist()):  # torch never compresses
+        raise ValueError("compressed")
+    if archive.testzip():  # torch does not verify the archive's checksums
         raise ValueError("damaged")
     return torch.load(path, map_location="cpu", weights_only=True)
+
+
+def build(network, config):
+    """A new network, whatever torch's default dtype and device are."""
+    with torch.device("cpu"):
+        return network(config).float()
 
 
 def load_weights(path: str | Path | None = None, network=D3DLO):
@@ -671,7 +685,7 @@ def load_weights(path: str | Path | None = None, network=D3DLO):
         state = read_archive(path)
         if "parts" in state:
             raise ValueError("it is a checkpoint, which only --resume can use")
-        net = network(Config(**state["config"]))
+        net = build(network, Config(**state["config"]))
         net.load_state_dict(state["model"])
         (low, high), motion = state["seen"], state["mean_motion"]
         if not (np.isfinite([*low, *high, *motion]).all() and len(motion) == 6
@@ -750,12 +764,11 @@ class Odometry:
         records = scan_records(scan, self.net.config, max(self.refine, 1))
         if invalid := records["invalid"][0]:
             warnings.warn(f"dropped {invalid} {INVALID_POINTS}", stacklevel=2)
-        pose = self.register_records(records)
         shift = kitti.domain_shift(records["stats"][0], self.facts["seen"])
         if shift and not self.warned:
             warnings.warn(f"{SHIFT_WARNING}: {shift}", stacklevel=2)
             self.warned = True
-        return pose
+        return self.register_records(records)
 
     def register_records(self, records):
         """`register` for a scan that is sampled already: records (max(refine, 1),) -> its pose."""
@@ -890,14 +903,16 @@ def record_of_file(scan_file, config):
 def load_records(sequences, config, cache="cache"):
     """The records (n,) of every sequence, a list: computed, or read from the folder `cache`.
 
-    Reports invalid points on stderr. Raises ValueError, naming the file, for a scan that
-    `scan_records` rejects.
+    Prints the notes of each `Sequence` and its number of invalid points on stderr. Raises
+    ValueError, naming the file, for a scan that `scan_records` rejects.
     """
     compute = functools.partial(record_of_file, config=config)
     settings = (__version__, config.sa1.r, config.sa2.r, config.sa3.r, config.plane,
                 config.max_range)  # n_fps and n_n determine the dtype
     loaded = kitti.cached_records(sequences, compute, record_dtype(config), settings, cache)
     for s, records in zip(sequences, loaded):
+        for note in s.notes:
+            print(f"sequence {s.name}: {note}", file=sys.stderr)
         if (invalid := records["invalid"]).any():
             print(f"sequence {s.name}: dropped {invalid.sum()} {INVALID_POINTS} in "
                   f"{np.count_nonzero(invalid)} of {len(s)} scans", file=sys.stderr)
@@ -998,7 +1013,6 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
             kitti.write_tum(out / "poses.tum", poses, s.times)
             results = {"path_m": metrics.path_lengths(poses)[-1], "scans": len(s)}
             lines = [f"{s.folder}: {len(s)} scans, path of {results['path_m']:.1f} m",
-                     *(f"note          {note}" for note in s.notes),
                      "frame         LiDAR at the first scan: x forward, y left, z up, in metres",
                      f"trajectory    {out}/poses.txt (12 numbers a line, as in KITTI's pose files)",
                      f"              {out}/poses.tum (t x y z qx qy qz qw, t in seconds)"]
@@ -1163,11 +1177,11 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     else:
         check_output(out, data or SIMULATED)
     config = config or (Config() if data else Config(**SHORT))
-    data, weights = (path and str(Path(path).resolve()) for path in (data, weights))
+    data, weights = (path and os.path.abspath(path) for path in (data, weights))
 
     # The network: as in the checkpoint, as in the weights, or with random weights
     torch.manual_seed(seed)
-    net, checkpoint, earlier = network(config), None, {}
+    net, checkpoint, earlier = build(network, config), None, {}
     if resume and (stored := Path(out) / "checkpoint.pt").exists():
         with reading_weights(stored):
             checkpoint = earlier = read_archive(stored)
@@ -1197,7 +1211,7 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
 
     def say(line):
         """Print a line and append it to the log."""
-        with open(run / "log.txt", "a", encoding="utf-8") as file:
+        with open(run / "log.txt", "a", encoding="utf-8", errors="backslashreplace") as file:
             file.write(line + "\n")
         print(line, flush=True)
 
@@ -1215,7 +1229,7 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
             evaluate(root, run, [s.name for s in held_out], run / "results", device, say=say,
                      network=network)
     except KeyboardInterrupt:
-        advice = f"to continue: python d3dlo.py train --out {run} --resume"
+        advice = f"continue with `python d3dlo.py train --out {run} --resume`"
         raise KeyboardInterrupt(advice) from None
     say(f"weights       {run}/weights.pt\n"
         f"next          python d3dlo.py eval --weights {run}{f' --data {data}' * bool(data)}")
@@ -1235,17 +1249,18 @@ def command_line(argv):
     commands = parser.add_subparsers(dest="command", required=True, metavar="train | eval")
     both = argparse.ArgumentParser(add_help=False, argument_default=argparse.SUPPRESS)
     add = both.add_argument
-    add("--data", metavar="ROOT", help=(
+    add("--data", metavar="ROOT", type=os.path.expanduser, help=(
         "folder in KITTI odometry layout; for eval also a folder of scans (default: a simulated "
         f"city, made in {SIMULATED})"))
     add("--sequences", nargs="+", metavar="NN", help=(
         "names, or splits: train, test, validation, all (default for train: train; for eval: all, "
         "or test and validation of the simulated city)"))
-    add("--weights", metavar="FILE|RUN", help=(
+    add("--weights", metavar="FILE|RUN", type=os.path.expanduser, help=(
         "a weights file, or the folder of a training run (default for eval: the pretrained "
         "weights; train starts from these weights and keeps their network and input settings)"))
     add("--device", help="cpu, cuda or mps (default: cpu)")
-    add("--out", metavar="DIR", help="new folder to write (default: runs/TIME or results/TIME)")
+    add("--out", metavar="DIR", type=os.path.expanduser, help=(
+        "new folder to write (default: runs/TIME or results/TIME)"))
 
     add = commands.add_parser("train", parents=[both], **settings, help=(
         "train, then evaluate on the test and validation splits")).add_argument
@@ -1298,7 +1313,8 @@ def main(argv=None):
     command = args.pop("command")
     kitti.keep_freed_memory()
     kitti.treat_sigterm_as_interrupt()
-    try:
+
+    def work():
         if empty := [name for name, value in args.items() if value == ""]:
             raise ValueError(f"--{empty[0]} is empty; give a value, or leave the option out")
         if command == "eval":
@@ -1308,20 +1324,11 @@ def main(argv=None):
                              "only --out RUN and, if needed, --device")
         else:
             train(config_from(args), **args)
-    except KeyboardInterrupt as interrupt:
-        advice = str(interrupt) or f"run it again{', with a new --out' * ('out' in args)}"
-        print(f"\nd3dlo: interrupted; {advice}", file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        sys.stdout = open(os.devnull, "w")  # otherwise Python complains at exit
-        advice = ("; continue with `python d3dlo.py train --out RUN --resume`"
-                  if command == "train" else "")
-        print(f"d3dlo: standard output was closed{advice}", file=sys.stderr)
-        return 2
-    except (ValueError, OSError) as error:
-        print(f"d3dlo: {error}", file=sys.stderr)
-        return 2
-    return 0
+
+    advice = "run it again" + ", with a new --out" * ("out" in args)
+    if command == "train":
+        advice = "continue with `python d3dlo.py train --out RUN --resume`"
+    return metrics.run_command("d3dlo", work, advice)
 
 
 if __name__ == "__main__":
