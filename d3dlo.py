@@ -20,13 +20,17 @@ C scans in a batch, B pairs of them; n1 to n3 and k1 to k3 are n_fps and n_n of 
     python d3dlo.py train --data ROOT           # on KITTI odometry, with the paper's settings
     python d3dlo.py eval --data ROOT            # with the pretrained weights
 """
+import os
+
+# PyTorch reads this when it is loaded: idle threads sleep. Spinning ones slow down a busy machine.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 import argparse
 import copy
 import functools
 import itertools
 import json
 import math
-import os
 import pickle
 import shutil
 import sys
