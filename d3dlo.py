@@ -28,6 +28,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import argparse
 import copy
 import functools
+import io
 import itertools
 import json
 import math
@@ -110,13 +111,16 @@ class Config:
         return json.loads(json.dumps(asdict(self)))
 
 
+def require(name, values, low, high):
+    """Raise a ValueError that names a number out of bounds. Integer bounds require integers."""
+    for x in values:
+        if isinstance(x, bool) or not isinstance(x, (int, type(low))) or not low <= x <= high:
+            kind = "an integer from " if isinstance(low, int) else ""
+            raise ValueError(f"{name} is {x!r}, but must be {kind}{low} to {high}")
+
+
 def check_config(config):
     """Raise a ValueError that names the invalid setting."""
-    def require(name, values, low, high):
-        for x in values:  # integers only, if the bounds are integers
-            if isinstance(x, bool) or not isinstance(x, (int, type(low))) or not low <= x <= high:
-                raise ValueError(f"Config: {name} is {x!r}, but must be {low} to {high}")
-
     sa = [config.sa1, config.sa2, config.sa3]
     grouping = [*sa, config.fe]
     widths = [layer.widths for layer in (*grouping, config.mpn, config.mlp)]
@@ -133,11 +137,11 @@ def check_config(config):
     require("lr", [config.lr], 1e-12, 1e3)
     require("frozen", [config.frozen], 0.0, 0.999)
     if config.mlp.widths[-1] != 6:
-        raise ValueError("Config: the last width of mlp must be 6: translation and angles")
+        raise ValueError("the last width of mlp must be 6: translation and angles")
     for name, choices in dict(plane=(True, False), augment=(True, False), swap=("random", "both"),
                               optimizer=("adam", "muon"), schedule=("steps", "one-cycle")).items():
         if getattr(config, name) not in choices:
-            raise ValueError(f"Config: {name} is {getattr(config, name)!r}, but must be "
+            raise ValueError(f"{name} is {getattr(config, name)!r}, but must be "
                              f"{choices[0]} or {choices[1]}")
 
 
@@ -301,15 +305,8 @@ def mlp_layers(c, widths):
     """An MLP such as h in eqs. 3 and 4. For each width: linear, batch normalisation, ReLU."""
     layers = []
     for c_in, c_out in itertools.pairwise((c, *widths)):
-        layers += [nn.Linear(c_in, c_out), nn.BatchNorm1d(c_out), nn.ReLU()]
+        layers += [nn.Linear(c_in, c_out), nn.BatchNorm1d(c_out), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers)
-
-
-def gather(u, idx):
-    """u (B,n,D), idx (B,S,k) -> (B,S,k,D): for every b the rows idx[b] of u[b]."""
-    B, n, D = u.shape
-    rows = idx + n * torch.arange(B, device=u.device)[:, None, None]  # of u reshaped to (B n,D)
-    return u.reshape(B * n, D).index_select(0, rows.flatten()).view(*idx.shape, D)
 
 
 class MiniPointNet(nn.Module):
@@ -332,13 +329,13 @@ class MiniPointNet(nn.Module):
         """
         u = F.linear(a, self.h[0].weight)  # (B,n,c1)
         v = self.h[0](b)  # (B,S,c1)
-        return self.after_first_layer(gather(u, idx).add_(v[:, :, None]))
+        rows = idx + a.shape[1] * torch.arange(len(a), device=a.device)[:, None, None]
+        u_i = u.flatten(0, 1).index_select(0, rows.flatten()).view(*idx.shape, -1)  # (B,S,k,c1)
+        return self.after_first_layer(u_i.add_(v[:, :, None]))
 
     def after_first_layer(self, z):
         """The output z (...,k,c1) of h's first layer -> its other layers, maximum (...,c')."""
-        points = z.flatten(0, -2)  # (points,c1): all points share the MLP
-        for layer in self.h[1:-1]:
-            points = F.relu_(points) if isinstance(layer, nn.ReLU) else layer(points)
+        points = self.h[1:-1](z.flatten(0, -2))  # (points,c'): all points share the MLP
         # ReLU is non-decreasing, so the last one may come after the maximum
         return F.relu(points.unflatten(0, z.shape[:-1]).amax(-2))
 
@@ -417,14 +414,6 @@ class D3DLO(nn.Module):
 CHECKPOINT_EVERY, WEIGHTS_EVERY = 60.0, 300.0  # seconds
 
 
-class MeanAbsoluteError(nn.Module):
-    """Eq. 2: the mean absolute error of all six outputs, metres and degrees alike."""
-
-    def forward(self, y_hat, y):
-        """Predictions and targets (B,6), (B,6) -> the loss ()."""
-        return (y - y_hat).abs().mean()
-
-
 def training_batch(data, pairs, config, rng, device="cpu"):
     """Load n pairs of scans -> Batch, and the motions T_pq (B,4,4) to predict.
 
@@ -465,9 +454,10 @@ def steps_per_epoch(pairs, config):
     Raises ValueError if a batch would hold one pair in one direction: the final MLP sees one row
     per pair, so batch normalisation would have no statistics.
     """
-    if config.swap == "random" and min(pairs, config.batch) < 2:
-        raise ValueError(f"batch size {config.batch} with {pairs} training pairs: batch "
-                         "normalisation needs at least 2 pairs per batch")
+    least = 2 if config.swap == "random" else 1
+    if min(pairs, config.batch) < least:
+        raise ValueError(f"batch size {config.batch} with {pairs} training pairs (consecutive "
+                         f"scans): batch normalisation needs at least {least} pairs per batch")
     return max(1, pairs // config.batch)
 
 
@@ -551,15 +541,16 @@ def fit(net, data, run, test=(), seed=0, device="cpu", objective=None, checkpoin
     objective: a module (y_hat, y) -> loss. None: eq. 2.
     checkpoint: the content of RUN/checkpoint.pt, to continue from it.
     say: called with each line to report.
-    facts: values to store with the weights, see `training_facts`.
+    facts: values to store with the weights: all that `training_facts` returns.
 
     RUN/checkpoint.pt holds all that a step changes, and a batch depends on the seed and its number
     alone. So on the same machine and with as many threads, a resumed run ends with the same
     weights, bit for bit. Raises ValueError if the loss, a weight or a statistic is not finite;
     nothing is stored from then on.
     """
-    config, run, objective = net.config, Path(run), (objective or MeanAbsoluteError()).to(device)
-    net.to(device)
+    # Eq. 2 is the mean absolute error of all six outputs, metres and degrees alike
+    objective = (objective or nn.L1Loss()).to(device)
+    config, run, net = net.config, Path(run), net.to(device)
     per_epoch = steps_per_epoch(len(all_pairs(data)), config)
     steps = config.epochs * per_epoch
     frozen_from = round(steps * (1 - config.frozen))  # from this step on, statistics are fixed
@@ -585,11 +576,12 @@ def fit(net, data, run, test=(), seed=0, device="cpu", objective=None, checkpoin
     def require_finite(x, name):
         if not math.isfinite(x):
             raise ValueError(f"{run}: {name} became non-finite at step {step} (learning rate "
-                             f"{schedulers[0].get_last_lr()[0]:.1e}); the last checkpoint, if any, "
-                             "was kept. Try a lower learning rate")
+                             f"{rate:.1e}); the last checkpoint, if any, was kept. Try a lower "
+                             "learning rate")
 
     def store(name, net, **content):
-        total = sum(tensor.double().sum().item() for tensor in net.state_dict().values())
+        tensors = [*net.state_dict().values(), *objective.parameters()]
+        total = sum(tensor.double().sum().item() for tensor in tensors)
         require_finite(total, "a weight or BatchNorm statistic")
         save(run / name, step=step, config=config.as_dict(), **content, **facts)
 
@@ -634,12 +626,10 @@ PRETRAINED = Path(__file__).with_name("d3dlo.pt")
 
 def save(path, **content):
     """Write weights or a checkpoint: state_dicts and plain values. Raises OSError on failure."""
-    with metrics.replacing(path) as temporary, open(temporary, "wb") as file:
-        try:
-            torch.save(content, file)
-        except RuntimeError as error:  # torch raises this when the disk is full
-            reason = str(error).splitlines()[0]
-            raise OSError(f"{path}: could not be written ({reason:.80})") from None
+    file = io.BytesIO()  # in memory first: torch raises a RuntimeError if the disk is full
+    torch.save(content, file)
+    with metrics.replacing(path) as temporary:
+        temporary.write_bytes(file.getbuffer())
 
 
 @contextmanager
@@ -748,7 +738,7 @@ class Odometry:
     def __init__(self, weights: str | Path | None = None, device: str = "cpu", refine: int = 0,
                  network=D3DLO):
         check_device(device)
-        check_number("refine", refine, most=100)  # the time of a scan grows with it
+        require("refine", [refine], 0, 100)  # the time of a scan grows with it
         net, self.facts = load_weights(weights, network)
         self.net, self.device, self.refine = net.to(device), device, refine
         self.warned = False  # about scans unlike those in training
@@ -927,8 +917,9 @@ def predict_poses(odometry, s, records):
     """Poses T_0t (n,4,4) of a sequence, whose records (n,) are known. Warns about domain shift."""
     shifts = [kitti.domain_shift(stats, odometry.facts["seen"]) for stats in records["stats"]]
     if any(shifts):
-        print(f"sequence {s.name}: {sum(map(bool, shifts))} of {len(s)} {SHIFT_WARNING}: "
-              f"{next(filter(None, shifts))}", file=sys.stderr)
+        unlike = [shift for shift in shifts if shift]
+        print(f"sequence {s.name}: {len(unlike)} of {len(s)} {SHIFT_WARNING}: {unlike[0]}",
+              file=sys.stderr)
     if not odometry.refine:  # many pairs at a time are faster than one by one
         return accumulate(predict_motions(odometry.net, records, odometry.device))
     odometry.restart()
@@ -1046,13 +1037,6 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
 SIMULATED = Path("data/simulated")  # the simulated city, used without --data
 
 
-def check_number(name, value, most=2**63 - 1):
-    """Raise ValueError unless a value is an integer from 0 to `most`."""
-    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not (whole and 0 <= value <= most):
-        raise ValueError(f"{name} must be a non-negative integer, at most {most:,}, not {value!r}")
-
-
 def check_device(device):
     """Raise ValueError if this PyTorch cannot use the device."""
     try:
@@ -1079,12 +1063,13 @@ def claim_output(out, kind, name, content):
 
     The file must not exist yet, so two processes never share a folder. Returns the folder.
     """
+    text = json.dumps(content, indent=1)
     folder = first = Path(out or time.strftime(f"{kind}/%Y-%m-%d-%H%M%S"))
     for i in itertools.count(2):
         folder.mkdir(parents=True, exist_ok=True)
         try:
             with open(folder / name, "x", encoding="utf-8") as file:
-                file.write(json.dumps(content, indent=1) + "\n")
+                file.write(text + "\n")
             return folder
         except FileExistsError:
             if out:
@@ -1093,19 +1078,18 @@ def claim_output(out, kind, name, content):
             folder = first.with_name(f"{first.name}-{i}")
 
 
-def data_root(data, names, whole=False):
-    """The folder `data` or, if it is None, that of the simulated city.
+def data_root(data, names):
+    """The folder `data` or, if it is None, that of the simulated city, with the sequences `names`.
 
-    Missing sequences of the city are simulated: those in `names`, or all if `whole` is true. Raises
-    ValueError for a name that the city does not have.
+    Missing ones are simulated. Raises ValueError for a name that the city does not have.
     """
     if data:
         return Path(data)
-    names = kitti.expand_splits(names or ())
+    names = kitti.expand_splits(names)
     if unknown := set(names) - set(kitti.expand_splits("all")):
         raise ValueError(f"the simulated city has no sequence {' '.join(sorted(unknown))}; "
                          f"available: 00 to 10, {', '.join(SPLITS)}, all")
-    return kitti.simulate(SIMULATED, sequences="all" if whole else names)
+    return kitti.simulate(SIMULATED, sequences=names)
 
 
 def choose_sequences(root, names=None):
@@ -1124,21 +1108,16 @@ def choose_sequences(root, names=None):
                          f"{' '.join(available)}; choose those to train on with --sequences")
     chosen = kitti.open_sequences(root, names)
     names = [s.name for s in chosen]
-    if not sum(len(s) - 1 for s in chosen):
-        raise ValueError(f"{root}: sequence {' '.join(names)} has one scan; training needs at "
-                         "least two scans")
     return chosen, kitti.open_sequences(root, [n for n in held_out if n not in names])
 
 
 def training_facts(fingerprints, motions, records, earlier):
     """What a weights file stores about its training data.
 
-    fingerprints: of the sequences; motions, records: of each of them; earlier: the same facts about
-    earlier training data, if training starts from other weights, or {}. The mean motion is that of
-    the new data.
+    fingerprints, motions, records: of each sequence. earlier: these facts in the weights that
+    training starts from, or {}. The mean motion is that of the new data.
     """
-    stats = [r["stats"] for r in records]
-    stats = np.concatenate([*stats, np.reshape(earlier.get("seen", ()), (-1, len(kitti.STATS)))])
+    stats = np.vstack([*(r["stats"] for r in records), *earlier.get("seen", ())])
     return {"trained_on": sorted({*fingerprints, *earlier.get("trained_on", ())}),
             "mean_motion": to_vector(np.concatenate(motions)).mean(0).tolist(),
             "seen": [stats.min(0).tolist(), stats.max(0).tolist()]}
@@ -1149,11 +1128,11 @@ def read_run(run):
     try:
         content = json.loads((run / "config.json").read_text(encoding="utf-8"))
         config, arguments = Config(**content["config"]), content["arguments"]
-        data, sequences, seed, weights = (arguments[name] for name in
-                                          ("data", "sequences", "seed", "weights"))
-        check_number("seed", seed)
-        data, weights = (path and str(Path(path)) for path in (data, weights))
-        return config, data, [str(Path(name)) for name in sequences], seed, weights
+        require("seed", [arguments["seed"]], 0, 2**63 - 1)
+        texts = [*arguments["sequences"], arguments["data"] or "", arguments["weights"] or ""]
+        if not all(isinstance(text, str) for text in texts):
+            raise ValueError("damaged")
+        return config, *(arguments[name] for name in ("data", "sequences", "seed", "weights"))
     except (ValueError, KeyError, TypeError, AttributeError, OSError):
         raise ValueError(f"{run}/config.json: missing or damaged, so there is no training run to "
                          "resume; give its folder with --out") from None
@@ -1175,18 +1154,19 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     is not finite, and OSError if a file cannot be read or written.
     """
     check_device(device)
-    check_number("seed", seed)
     if resume:
-        config, data, sequences, seed, weights = read_run(Path(out or ""))
+        run = Path(out or "")
+        config, data, sequences, seed, weights = read_run(run)
     else:
         check_output(out, data or SIMULATED)
+    require("seed", [seed], 0, 2**63 - 1)
     config = config or (Config() if data else Config(**SHORT))
     data, weights = (path and os.path.abspath(path) for path in (data, weights))
 
     # The network: as in the checkpoint, as in the weights, or with random weights
     torch.manual_seed(seed)
     net, checkpoint, earlier = build(network, config), None, {}
-    if resume and (stored := Path(out) / "checkpoint.pt").exists():
+    if resume and (stored := run / "checkpoint.pt").exists():
         with reading_weights(stored):
             checkpoint = earlier = read_archive(stored)
     elif weights:
@@ -1195,7 +1175,7 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
         net.config = replace(net.config, **settings)
 
     # The data. All scans are read, so that an unusable one is found now and not after the training
-    root = data_root(data, sequences, whole=True)
+    root = data_root(data, [*(sequences or ()), "all"])
     chosen, held_out = choose_sequences(root, sequences)
     motions, names = [s.motions() for s in chosen], [s.name for s in chosen]
     per_epoch = steps_per_epoch(sum(map(len, motions)), net.config)
@@ -1205,13 +1185,14 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     fingerprints = [s.fingerprint(records["crc"]) for s, records in zip(chosen, loaded)]
     facts = training_facts(fingerprints, motions, loaded[:len(chosen)], earlier)
     if checkpoint and checkpoint["trained_on"] != facts["trained_on"]:
-        raise ValueError(f"{out}: the data has changed since this training run started; resume it "
+        raise ValueError(f"{run}: the data has changed since this training run started; resume it "
                          "with the data it was started with")
 
     arguments = dict(data=data, sequences=names, seed=seed, device=device, weights=weights)
     versions = kitti.versions(Path(__file__).parent) | {"d3dlo": __version__}
-    run = Path(out) if resume else claim_output(out, "runs", "config.json", {
-        "arguments": arguments, "config": net.config.as_dict(), "versions": versions})
+    if not resume:
+        run = claim_output(out, "runs", "config.json", {
+            "arguments": arguments, "config": net.config.as_dict(), "versions": versions})
 
     def say(line):
         """Print a line and append it to the log."""
@@ -1223,7 +1204,8 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
         parameters = sum(p.numel() for p in net.parameters())
         say(f"{parameters:,} parameters, {sum(map(len, motions)):,} pairs of scans of "
             f"{' '.join(names)}, {net.config.epochs} epochs of {per_epoch} batches -> {run}")
-        if not sequences and (missing := set(SPLITS["train"]) - set(names)):
+        missing = set(SPLITS["train"]) - set(names)
+        if not sequences and 0 < len(missing) < len(SPLITS["train"]):
             say(f"missing from the training split: {' '.join(sorted(missing))}")
         fit(net, [*zip(loaded, motions)], run, test, seed, device, objective, checkpoint, say,
             **facts)

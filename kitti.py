@@ -33,7 +33,7 @@ import warnings
 import zlib
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from decimal import Decimal
 from pathlib import Path
 from typing import NamedTuple
@@ -44,6 +44,7 @@ from scipy.spatial.transform import Rotation
 
 from metrics import (
     is_rigid,
+    parse,
     path_lengths,
     read_lines,
     read_poses,
@@ -64,6 +65,15 @@ SPLITS = {
 # Frames
 
 
+def rigid(R, t):
+    """Rotations (...,3,3) and translations (...,3) -> rigid transforms (...,4,4) float64."""
+    T = np.zeros((*R.shape[:-2], 4, 4))
+    T[..., :3, :3] = R
+    T[..., :3, 3] = t
+    T[..., 3, 3] = 1
+    return T
+
+
 def invert(T):
     """The inverses of rigid transforms (...,4,4): R^T and -R^T t for R and t.
 
@@ -71,11 +81,7 @@ def invert(T):
     """
     T = np.asarray(T, dtype=float)
     R_inverse = np.swapaxes(T[..., :3, :3], -1, -2)
-    out = np.zeros_like(T)
-    out[..., :3, :3] = R_inverse
-    out[..., :3, 3:] = -R_inverse @ T[..., :3, 3:]
-    out[..., 3, 3] = 1
-    return out
+    return rigid(R_inverse, (-R_inverse @ T[..., :3, 3:])[..., 0])
 
 
 def camera_to_velo(T_cam, Tr):
@@ -107,11 +113,8 @@ def to_vector(T: np.ndarray) -> np.ndarray:
 def from_vector(v: np.ndarray) -> np.ndarray:
     """The inverse of `to_vector`: (...,6) in metres and degrees -> (...,4,4) float64."""
     v = np.asarray(v, dtype=float)
-    flat = v.reshape(-1, 6)
-    T = np.tile(np.eye(4), (len(flat), 1, 1))
-    T[:, :3, :3] = Rotation.from_euler("xyz", flat[:, 3:], degrees=True).as_matrix()
-    T[:, :3, 3] = flat[:, :3]
-    return T.reshape(*v.shape[:-1], 4, 4)
+    R = Rotation.from_euler("xyz", v[..., 3:].reshape(-1, 3), degrees=True).as_matrix()
+    return rigid(R.reshape(*v.shape[:-1], 3, 3), v[..., :3])
 
 
 # ------------------------------------------------------------------------------------------------
@@ -227,10 +230,7 @@ def read_calib(path: str | Path) -> np.ndarray:
 def _calib_row(path, name, count):
     """The numbers (count,) of row `name` in a calibration file, NaN if there is no such row."""
     rows = [words[1:] for _, words in read_lines(path) if words[0] == f"{name}:"]
-    try:
-        return np.array(rows[0], dtype=float).reshape(count)
-    except (IndexError, ValueError):
-        return np.full(count, np.nan)
+    return parse(rows[0] if rows else [], count)
 
 
 def write_tum(path: str | Path, T: np.ndarray, times: np.ndarray) -> None:
@@ -262,6 +262,9 @@ class Sequence:
     def __init__(self, folder, truth=None):
         self.folder, self.name = Path(folder), Path(os.path.abspath(folder)).name
         self.scan_paths = scans_in(self.folder / "velodyne" if truth else folder)
+        if not self.scan_paths:
+            raise FileNotFoundError(f"{folder} holds no scans, *.bin or *.npy; KITTI's are in "
+                                    "data_odometry_velodyne.zip.")
         self.Tr = self.poses_cam = self.poses = None
         self.intensity_max, self.notes = 1, []
         if truth:
@@ -271,9 +274,6 @@ class Sequence:
 
     def _open_kitti(self, truth):
         """Check the scans; read calib.txt and, if it exists, the ground truth."""
-        if not self.scan_paths:
-            raise FileNotFoundError(f"{self.folder / 'velodyne'} holds no scans: unpack "
-                                    "data_odometry_velodyne.zip; the other archives hold none.")
         for i, path in enumerate(self.scan_paths):
             if path.name != f"{i:06d}.bin":
                 raise ValueError(f"{path.parent} should hold {i:06d}.bin next but holds "
@@ -339,11 +339,8 @@ class Sequence:
 
     def _read_times(self, path):
         """The times (n,) [s] in a times.txt, one per line."""
-        try:
-            times = np.array([words[0] for _, words in read_lines(path)], dtype=float)
-        except ValueError:
-            times = np.empty(0)
-        if len(times) != len(self) or not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
+        times = parse([words[0] for _, words in read_lines(path)], len(self))
+        if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
             raise ValueError(f"{path} must hold {len(self)} increasing numbers, the time of each "
                              "scan in seconds: correct it, or remove it to assume 10 scans a "
                              "second.")
@@ -382,11 +379,9 @@ class Sequence:
 
 def expand_splits(names):
     """Names of sequences and splits, or one of them -> names of sequences, each once, in order."""
-    expanded = {}  # a dict keeps the order
-    for name in [names] if isinstance(names, str) else names:
-        members = sum(SPLITS.values(), ()) if name == "all" else SPLITS.get(name, (name,))
-        expanded |= dict.fromkeys(members)
-    return list(expanded)
+    names = [names] if isinstance(names, str) else names
+    groups = SPLITS | {"all": sum(SPLITS.values(), ())}
+    return list(dict.fromkeys(member for name in names for member in groups.get(name, (name,))))
 
 
 def sequence_names(root: str | Path) -> list[str]:
@@ -634,12 +629,10 @@ def keep_freed_memory():
     Otherwise every allocation causes new page faults, which cost a third of a training step's time
     on a CPU.
     """
-    try:
+    with suppress(OSError, AttributeError, TypeError):  # another C library
         libc = ctypes.CDLL(None)
         libc.mallopt(-4, 0)  # M_MMAP_MAX: large blocks come from the heap too
         libc.mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: the heap never shrinks
-    except (OSError, AttributeError, TypeError):  # another C library
-        pass
 
 
 def versions(folder):
@@ -691,12 +684,10 @@ def _load(file, dtype, n):
     """The records (n,) in a cache file, or None. Reports a damaged file."""
     if not file.is_file():
         return None
-    try:
+    with suppress(Exception):  # np.load raises many exception types; all mean a corrupt file
         records = np.load(file, mmap_mode="r")  # pickles are off by default, so no code runs
         if (records.dtype, records.shape) == (dtype, (n,)):
             return records
-    except Exception:  # np.load raises many exception types; all of them mean a corrupt file
-        pass
     print(f"{file}: damaged, so it is computed again", file=sys.stderr)
     return None
 
@@ -717,11 +708,6 @@ def new_folder(path):
 # KITTI's raw drives: readme.txt of the raw data devkit, and oxts/dataformat.txt of each drive
 
 EARTH_RADIUS = 6378137.0  # [m]; devkit: latlonToMercator.m
-# Columns of a GPS/IMU packet
-LAT_LON_ALT = slice(0, 3)  # degrees, degrees, m
-ROLL_PITCH_YAW = slice(3, 6)  # rad
-VELOCITY = [7, 6, 10]  # m/s to the east, to the north and upwards
-ANGULAR_VELOCITY = slice(17, 20)  # rad/s about the unit's x, y and z axes
 MAX_DELAY = np.timedelta64(100, "ms")  # a scan farther from every packet has no pose
 SECOND = np.timedelta64(1, "s")
 
@@ -827,10 +813,7 @@ def _raw_stream(folder, suffix):
 
 def _read_packet(path):
     """Read a GPS/IMU packet: (30,) numbers in the order of oxts/dataformat.txt."""
-    try:
-        packet = np.array(path.read_bytes().split(), dtype=float).reshape(30)
-    except ValueError:
-        packet = np.full(30, np.nan)
+    packet = parse(path.read_bytes().split(), 30)
     if not np.isfinite(packet).all():
         raise ValueError(f"{path} is damaged: a GPS/IMU packet is 30 finite numbers; "
                          "unpack the drive again.")
@@ -865,19 +848,17 @@ def _imu_poses(packets, delay):
     taken as constant. The unit then moves along an arc, whose chord has the direction of the
     velocity half-way.
     """
-    lat, lon, alt = packets[:, LAT_LON_ALT].T
+    lat, lon, alt = packets[:, :3].T  # (n,) each; degrees, degrees, m
+    velocity = packets[:, [7, 6, 10]]  # (n,3) m/s, to the east, to the north and upwards
+    turn_rate = packets[:, 17:20]  # (n,3) rad/s, about the unit's x, y and z axes
     scale = EARTH_RADIUS * np.cos(np.radians(lat[0]))
     east = scale * np.radians(lon)
     north = scale * np.log(np.tan(np.radians(90 + lat) / 2))
-    attitude = Rotation.from_euler("xyz", packets[:, ROLL_PITCH_YAW])
-    # Rotation vectors along the axes of the world (n,3)
-    turn = attitude.apply(packets[:, ANGULAR_VELOCITY]) * delay[:, None]
+    attitude = Rotation.from_euler("xyz", packets[:, 3:6])  # roll, pitch, yaw [rad]
+    turn = attitude.apply(turn_rate) * delay[:, None]  # (n,3), about the axes of the world
     half_turn = Rotation.from_rotvec(turn / 2)
-    T = np.tile(np.eye(4), (len(packets), 1, 1))  # (n,4,4)
-    T[:, :3, :3] = (Rotation.from_rotvec(turn) * attitude).as_matrix()
-    T[:, :3, 3] = np.stack([east, north, alt], axis=1)
-    T[:, :3, 3] += half_turn.apply(packets[:, VELOCITY] * delay[:, None])
-    return T
+    position = np.stack([east, north, alt], axis=1) + half_turn.apply(velocity * delay[:, None])
+    return rigid((Rotation.from_rotvec(turn) * attitude).as_matrix(), position)
 
 
 # ------------------------------------------------------------------------------------------------

@@ -204,8 +204,8 @@ def replacing(path):
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
-        if error.filename is None and error.strerror:  # such as for a full disk
-            raise OSError(error.errno, error.strerror, str(path)) from None
+        if error.filename is None:  # such as for a full disk
+            raise OSError(f"{path}: could not be written ({error.strerror or error})") from None
         raise
     finally:
         temporary.unlink(missing_ok=True)
@@ -239,6 +239,14 @@ COLUMN_HINTS = {8: "a line of 8 is that of a TUM file, t x y z qx qy qz qw",
                 16: "a line of 16 is a whole 4x4 matrix, of which the last row is to be cut off"}
 
 
+def parse(words, n):
+    """The n numbers that a list of words spells (n,); NaN if they are not n numbers."""
+    try:
+        return np.array(words, dtype=float).reshape(n)
+    except ValueError:
+        return np.full(n, np.nan)
+
+
 def read_poses(path: str | Path) -> np.ndarray:
     """Read a KITTI pose file.
 
@@ -251,10 +259,7 @@ def read_poses(path: str | Path) -> np.ndarray:
         raise ValueError(f"{path}: holds no pose; give a KITTI pose file, 12 numbers a line")
     T = np.tile(np.eye(4), (len(lines), 1, 1))  # (n,4,4)
     for pose, (number, words) in zip(T, lines):
-        try:
-            pose[:3] = np.array(words, float).reshape(3, 4)
-        except ValueError:
-            pose[:] = np.nan
+        pose[:3] = parse(words, 12).reshape(3, 4)
         if not np.isfinite(pose).all():
             hint = COLUMN_HINTS.get(len(words), "correct the line")
             raise ValueError(f"{path}, line {number}: {len(words)} words, but a KITTI pose is 12 "
@@ -324,8 +329,7 @@ def draw(path, trajectories):
     Each name is a row: the path from above and, if there is any ground truth, KITTI's errors by
     segment length. Raises ValueError without matplotlib, and OSError if writing fails.
     """
-    any_truth = any(T_gt is not None for T_gt, _ in trajectories.values())
-    columns = 3 if any_truth else 1
+    columns = 3 if any(T_gt is not None for T_gt, _ in trajectories.values()) else 1
     figure = new_figure(3.5 * columns, 3.1 * len(trajectories))
     rows = figure.subplots(len(trajectories), columns, squeeze=False)
     for (name, (T_gt, T_est)), (above, *errors) in zip(trajectories.items(), rows):
@@ -400,8 +404,7 @@ def _compare(gt, est, picture=None):
     """Compare pose files or folders. Returns the text to print; draws the picture, if any."""
     pairs = _pairs_of_files(gt, est)
     if picture and (picture.suffix not in PICTURES
-                    or picture.resolve() in [path.resolve() for pair in pairs.values()
-                                             for path in pair]):
+                    or picture.resolve() in (gt.resolve(), est.resolve())):
         raise ValueError(f"--plot {picture}: give the name of a new {', '.join(PICTURES)} file")
     trajectories, segments, steps, rows = {}, [], [], []
     for name, (gt, est) in pairs.items():
