@@ -32,6 +32,7 @@ import io
 import itertools
 import json
 import math
+import numbers
 import pickle
 import shutil
 import sys
@@ -113,10 +114,11 @@ class Config:
 
 def require(name, values, low, high):
     """Raise a ValueError that names a number out of bounds. Integer bounds require integers."""
+    kind = numbers.Integral if isinstance(low, int) else numbers.Real
     for x in values:
-        if isinstance(x, bool) or not isinstance(x, (int, type(low))) or not low <= x <= high:
-            kind = "an integer from " if isinstance(low, int) else ""
-            raise ValueError(f"{name} is {x!r}, but must be {kind}{low} to {high}")
+        if isinstance(x, bool) or not isinstance(x, kind) or not low <= x <= high:
+            which = "an integer from " if kind is numbers.Integral else ""
+            raise ValueError(f"{name} is {x!r}, but must be {which}{low} to {high}")
 
 
 def check_config(config):
@@ -1188,7 +1190,7 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
         raise ValueError(f"{run}: the data has changed since this training run started; resume it "
                          "with the data it was started with")
 
-    arguments = dict(data=data, sequences=names, seed=seed, device=device, weights=weights)
+    arguments = dict(data=data, sequences=names, seed=int(seed), device=device, weights=weights)
     versions = kitti.versions(Path(__file__).parent) | {"d3dlo": __version__}
     if not resume:
         run = claim_output(out, "runs", "config.json", {
