@@ -20,13 +20,19 @@ C scans in a batch, B pairs of them; n1 to n3 and k1 to k3 are n_fps and n_n of 
     python d3dlo.py train --data ROOT           # on KITTI odometry, with the paper's settings
     python d3dlo.py eval --data ROOT            # with the pretrained weights
 """
+import os
+
+# PyTorch reads this when it is loaded: idle threads sleep. Spinning ones slow down a busy machine.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 import argparse
 import copy
 import functools
+import io
 import itertools
 import json
 import math
-import os
+import numbers
 import pickle
 import shutil
 import sys
@@ -106,13 +112,17 @@ class Config:
         return json.loads(json.dumps(asdict(self)))
 
 
+def require(name, values, low, high):
+    """Raise a ValueError that names a number out of bounds. Integer bounds require integers."""
+    kind = numbers.Integral if isinstance(low, int) else numbers.Real
+    for x in values:
+        if isinstance(x, bool) or not isinstance(x, kind) or not low <= x <= high:
+            which = "an integer from " if kind is numbers.Integral else ""
+            raise ValueError(f"{name} is {x!r}, but must be {which}{low} to {high}")
+
+
 def check_config(config):
     """Raise a ValueError that names the invalid setting."""
-    def require(name, values, low, high):
-        for x in values:  # integers only, if the bounds are integers
-            if isinstance(x, bool) or not isinstance(x, (int, type(low))) or not low <= x <= high:
-                raise ValueError(f"Config: {name} is {x!r}, but must be {low} to {high}")
-
     sa = [config.sa1, config.sa2, config.sa3]
     grouping = [*sa, config.fe]
     widths = [layer.widths for layer in (*grouping, config.mpn, config.mlp)]
@@ -129,11 +139,11 @@ def check_config(config):
     require("lr", [config.lr], 1e-12, 1e3)
     require("frozen", [config.frozen], 0.0, 0.999)
     if config.mlp.widths[-1] != 6:
-        raise ValueError("Config: the last width of mlp must be 6: translation and angles")
+        raise ValueError("the last width of mlp must be 6: translation and angles")
     for name, choices in dict(plane=(True, False), augment=(True, False), swap=("random", "both"),
                               optimizer=("adam", "muon"), schedule=("steps", "one-cycle")).items():
         if getattr(config, name) not in choices:
-            raise ValueError(f"Config: {name} is {getattr(config, name)!r}, but must be "
+            raise ValueError(f"{name} is {getattr(config, name)!r}, but must be "
                              f"{choices[0]} or {choices[1]}")
 
 
@@ -225,11 +235,15 @@ def scan_records(scan: np.ndarray, config: Config = Config(), n: int = 1) -> np.
     """
     scan, invalid = kitti.usable_points(scan, config.max_range, config.plane)
     sa1, sa2, sa3 = config.sa1, config.sa2, config.sa3
-    if len(scan) < sa1.n_fps:
-        reach = config.max_range or kitti.MAX_VALID_RANGE
-        raise ValueError(f"{len(scan)} usable points (finite, within {reach:.0f} m"
-                         f"{'' if config.plane else ', off the ground'}), but the network needs "
-                         f"{sa1.n_fps}; are the coordinates in metres?")
+
+    def require_enough(points):
+        if points < sa1.n_fps:
+            reach = config.max_range or kitti.MAX_VALID_RANGE
+            raise ValueError(f"{points} different usable points (finite, within {reach:.0f} m"
+                             f"{'' if config.plane else ', off the ground'}), but the network "
+                             f"needs {sa1.n_fps}; are the coordinates in metres?")
+
+    require_enough(len(scan))
     cloud = np.ascontiguousarray(scan[:, :3])
     tree = cKDTree(cloud, leafsize=48, balanced_tree=False, compact_nodes=False)  # fast to build
     parts = min(n, len(cloud) // sa1.n_fps)
@@ -240,6 +254,7 @@ def scan_records(scan: np.ndarray, config: Config = Config(), n: int = 1) -> np.
         centroids = part + parts * centroids  # indices into cloud
         neighbours = group_ball(cloud, centroids, sa1.r, sa1.n_n, tree)  # (n1,k1)
         record["xyz"] = xyz = cloud[centroids]  # (n1,3)
+        require_enough(len(np.unique(xyz, axis=0)))
         record["group_sa1"][..., 0] = scan[neighbours, 3]  # (n1,k1)
         record["group_sa1"][..., 1:] = cloud[neighbours] - xyz[:, None]  # (n1,k1,3)
         # One sampling serves all layers. Farthest point sampling of SA1's centroids would choose
@@ -292,15 +307,8 @@ def mlp_layers(c, widths):
     """An MLP such as h in eqs. 3 and 4. For each width: linear, batch normalisation, ReLU."""
     layers = []
     for c_in, c_out in itertools.pairwise((c, *widths)):
-        layers += [nn.Linear(c_in, c_out), nn.BatchNorm1d(c_out), nn.ReLU()]
+        layers += [nn.Linear(c_in, c_out), nn.BatchNorm1d(c_out), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers)
-
-
-def gather(u, idx):
-    """u (B,n,D), idx (B,S,k) -> (B,S,k,D): for every b the rows idx[b] of u[b]."""
-    B, n, D = u.shape
-    rows = idx + n * torch.arange(B, device=u.device)[:, None, None]  # of u reshaped to (B n,D)
-    return u.reshape(B * n, D).index_select(0, rows.flatten()).view(*idx.shape, D)
 
 
 class MiniPointNet(nn.Module):
@@ -323,13 +331,13 @@ class MiniPointNet(nn.Module):
         """
         u = F.linear(a, self.h[0].weight)  # (B,n,c1)
         v = self.h[0](b)  # (B,S,c1)
-        return self.after_first_layer(gather(u, idx).add_(v[:, :, None]))
+        rows = idx + a.shape[1] * torch.arange(len(a), device=a.device)[:, None, None]
+        u_i = u.flatten(0, 1).index_select(0, rows.flatten()).view(*idx.shape, -1)  # (B,S,k,c1)
+        return self.after_first_layer(u_i.add_(v[:, :, None]))
 
     def after_first_layer(self, z):
         """The output z (...,k,c1) of h's first layer -> its other layers, maximum (...,c')."""
-        points = z.flatten(0, -2)  # (points,c1): all points share the MLP
-        for layer in self.h[1:-1]:
-            points = F.relu_(points) if isinstance(layer, nn.ReLU) else layer(points)
+        points = self.h[1:-1](z.flatten(0, -2))  # (points,c'): all points share the MLP
         # ReLU is non-decreasing, so the last one may come after the maximum
         return F.relu(points.unflatten(0, z.shape[:-1]).amax(-2))
 
@@ -408,14 +416,6 @@ class D3DLO(nn.Module):
 CHECKPOINT_EVERY, WEIGHTS_EVERY = 60.0, 300.0  # seconds
 
 
-class MeanAbsoluteError(nn.Module):
-    """Eq. 2: the mean absolute error of all six outputs, metres and degrees alike."""
-
-    def forward(self, y_hat, y):
-        """Predictions and targets (B,6), (B,6) -> the loss ()."""
-        return (y - y_hat).abs().mean()
-
-
 def training_batch(data, pairs, config, rng, device="cpu"):
     """Load n pairs of scans -> Batch, and the motions T_pq (B,4,4) to predict.
 
@@ -456,9 +456,10 @@ def steps_per_epoch(pairs, config):
     Raises ValueError if a batch would hold one pair in one direction: the final MLP sees one row
     per pair, so batch normalisation would have no statistics.
     """
-    if config.swap == "random" and min(pairs, config.batch) < 2:
-        raise ValueError(f"batch size {config.batch} with {pairs} training pairs: batch "
-                         "normalisation needs at least 2 pairs per batch")
+    least = 2 if config.swap == "random" else 1
+    if min(pairs, config.batch) < least:
+        raise ValueError(f"batch size {config.batch} with {pairs} training pairs (consecutive "
+                         f"scans): batch normalisation needs at least {least} pairs per batch")
     return max(1, pairs // config.batch)
 
 
@@ -542,15 +543,16 @@ def fit(net, data, run, test=(), seed=0, device="cpu", objective=None, checkpoin
     objective: a module (y_hat, y) -> loss. None: eq. 2.
     checkpoint: the content of RUN/checkpoint.pt, to continue from it.
     say: called with each line to report.
-    facts: values to store with the weights, see `training_facts`.
+    facts: values to store with the weights: all that `training_facts` returns.
 
     RUN/checkpoint.pt holds all that a step changes, and a batch depends on the seed and its number
     alone. So on the same machine and with as many threads, a resumed run ends with the same
     weights, bit for bit. Raises ValueError if the loss, a weight or a statistic is not finite;
     nothing is stored from then on.
     """
-    config, run, objective = net.config, Path(run), (objective or MeanAbsoluteError()).to(device)
-    net.to(device)
+    # Eq. 2 is the mean absolute error of all six outputs, metres and degrees alike
+    objective = (objective or nn.L1Loss()).to(device)
+    config, run, net = net.config, Path(run), net.to(device)
     per_epoch = steps_per_epoch(len(all_pairs(data)), config)
     steps = config.epochs * per_epoch
     frozen_from = round(steps * (1 - config.frozen))  # from this step on, statistics are fixed
@@ -576,11 +578,12 @@ def fit(net, data, run, test=(), seed=0, device="cpu", objective=None, checkpoin
     def require_finite(x, name):
         if not math.isfinite(x):
             raise ValueError(f"{run}: {name} became non-finite at step {step} (learning rate "
-                             f"{schedulers[0].get_last_lr()[0]:.1e}); the last checkpoint, if any, "
-                             "was kept. Try a lower learning rate")
+                             f"{rate:.1e}); the last checkpoint, if any, was kept. Try a lower "
+                             "learning rate")
 
     def store(name, net, **content):
-        total = sum(tensor.double().sum().item() for tensor in net.state_dict().values())
+        tensors = [*net.state_dict().values(), *objective.parameters()]
+        total = sum(tensor.double().sum().item() for tensor in tensors)
         require_finite(total, "a weight or BatchNorm statistic")
         save(run / name, step=step, config=config.as_dict(), **content, **facts)
 
@@ -625,12 +628,10 @@ PRETRAINED = Path(__file__).with_name("d3dlo.pt")
 
 def save(path, **content):
     """Write weights or a checkpoint: state_dicts and plain values. Raises OSError on failure."""
-    with metrics.replacing(path) as temporary, open(temporary, "wb") as file:
-        try:
-            torch.save(content, file)
-        except RuntimeError as error:  # torch raises this when the disk is full
-            reason = str(error).splitlines()[0]
-            raise OSError(f"{path}: could not be written ({reason:.80})") from None
+    file = io.BytesIO()  # in memory first: torch raises a RuntimeError if the disk is full
+    torch.save(content, file)
+    with metrics.replacing(path) as temporary:
+        temporary.write_bytes(file.getbuffer())
 
 
 @contextmanager
@@ -648,9 +649,18 @@ def reading_weights(path):
 
 def read_archive(path):
     """The content of a weights file or checkpoint, a dict. Code in the file is never run."""
-    if zipfile.ZipFile(path).testzip():  # torch does not verify the archive's checksums
+    archive = zipfile.ZipFile(path)
+    if any(entry.compress_type for entry in archive.infolist()):  # torch never compresses
+        raise ValueError("compressed")
+    if archive.testzip():  # torch does not verify the archive's checksums
         raise ValueError("damaged")
     return torch.load(path, map_location="cpu", weights_only=True)
+
+
+def build(network, config):
+    """A new network, whatever torch's default dtype and device are."""
+    with torch.device("cpu"):
+        return network(config).float()
 
 
 def load_weights(path: str | Path | None = None, network=D3DLO):
@@ -671,7 +681,7 @@ def load_weights(path: str | Path | None = None, network=D3DLO):
         state = read_archive(path)
         if "parts" in state:
             raise ValueError("it is a checkpoint, which only --resume can use")
-        net = network(Config(**state["config"]))
+        net = build(network, Config(**state["config"]))
         net.load_state_dict(state["model"])
         (low, high), motion = state["seen"], state["mean_motion"]
         if not (np.isfinite([*low, *high, *motion]).all() and len(motion) == 6
@@ -730,7 +740,7 @@ class Odometry:
     def __init__(self, weights: str | Path | None = None, device: str = "cpu", refine: int = 0,
                  network=D3DLO):
         check_device(device)
-        check_number("refine", refine, most=100)  # the time of a scan grows with it
+        require("refine", [refine], 0, 100)  # the time of a scan grows with it
         net, self.facts = load_weights(weights, network)
         self.net, self.device, self.refine = net.to(device), device, refine
         self.warned = False  # about scans unlike those in training
@@ -750,12 +760,11 @@ class Odometry:
         records = scan_records(scan, self.net.config, max(self.refine, 1))
         if invalid := records["invalid"][0]:
             warnings.warn(f"dropped {invalid} {INVALID_POINTS}", stacklevel=2)
-        pose = self.register_records(records)
         shift = kitti.domain_shift(records["stats"][0], self.facts["seen"])
         if shift and not self.warned:
             warnings.warn(f"{SHIFT_WARNING}: {shift}", stacklevel=2)
             self.warned = True
-        return pose
+        return self.register_records(records)
 
     def register_records(self, records):
         """`register` for a scan that is sampled already: records (max(refine, 1),) -> its pose."""
@@ -890,14 +899,16 @@ def record_of_file(scan_file, config):
 def load_records(sequences, config, cache="cache"):
     """The records (n,) of every sequence, a list: computed, or read from the folder `cache`.
 
-    Reports invalid points on stderr. Raises ValueError, naming the file, for a scan that
-    `scan_records` rejects.
+    Prints the notes of each `Sequence` and its number of invalid points on stderr. Raises
+    ValueError, naming the file, for a scan that `scan_records` rejects.
     """
     compute = functools.partial(record_of_file, config=config)
     settings = (__version__, config.sa1.r, config.sa2.r, config.sa3.r, config.plane,
                 config.max_range)  # n_fps and n_n determine the dtype
     loaded = kitti.cached_records(sequences, compute, record_dtype(config), settings, cache)
     for s, records in zip(sequences, loaded):
+        for note in s.notes:
+            print(f"sequence {s.name}: {note}", file=sys.stderr)
         if (invalid := records["invalid"]).any():
             print(f"sequence {s.name}: dropped {invalid.sum()} {INVALID_POINTS} in "
                   f"{np.count_nonzero(invalid)} of {len(s)} scans", file=sys.stderr)
@@ -908,8 +919,9 @@ def predict_poses(odometry, s, records):
     """Poses T_0t (n,4,4) of a sequence, whose records (n,) are known. Warns about domain shift."""
     shifts = [kitti.domain_shift(stats, odometry.facts["seen"]) for stats in records["stats"]]
     if any(shifts):
-        print(f"sequence {s.name}: {sum(map(bool, shifts))} of {len(s)} {SHIFT_WARNING}: "
-              f"{next(filter(None, shifts))}", file=sys.stderr)
+        unlike = [shift for shift in shifts if shift]
+        print(f"sequence {s.name}: {len(unlike)} of {len(s)} {SHIFT_WARNING}: {unlike[0]}",
+              file=sys.stderr)
     if not odometry.refine:  # many pairs at a time are faster than one by one
         return accumulate(predict_motions(odometry.net, records, odometry.device))
     odometry.restart()
@@ -998,7 +1010,6 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
             kitti.write_tum(out / "poses.tum", poses, s.times)
             results = {"path_m": metrics.path_lengths(poses)[-1], "scans": len(s)}
             lines = [f"{s.folder}: {len(s)} scans, path of {results['path_m']:.1f} m",
-                     *(f"note          {note}" for note in s.notes),
                      "frame         LiDAR at the first scan: x forward, y left, z up, in metres",
                      f"trajectory    {out}/poses.txt (12 numbers a line, as in KITTI's pose files)",
                      f"              {out}/poses.tum (t x y z qx qy qz qw, t in seconds)"]
@@ -1028,13 +1039,6 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
 SIMULATED = Path("data/simulated")  # the simulated city, used without --data
 
 
-def check_number(name, value, most=2**63 - 1):
-    """Raise ValueError unless a value is an integer from 0 to `most`."""
-    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-    if not (whole and 0 <= value <= most):
-        raise ValueError(f"{name} must be a non-negative integer, at most {most:,}, not {value!r}")
-
-
 def check_device(device):
     """Raise ValueError if this PyTorch cannot use the device."""
     try:
@@ -1061,12 +1065,13 @@ def claim_output(out, kind, name, content):
 
     The file must not exist yet, so two processes never share a folder. Returns the folder.
     """
+    text = json.dumps(content, indent=1)
     folder = first = Path(out or time.strftime(f"{kind}/%Y-%m-%d-%H%M%S"))
     for i in itertools.count(2):
         folder.mkdir(parents=True, exist_ok=True)
         try:
             with open(folder / name, "x", encoding="utf-8") as file:
-                file.write(json.dumps(content, indent=1) + "\n")
+                file.write(text + "\n")
             return folder
         except FileExistsError:
             if out:
@@ -1075,19 +1080,18 @@ def claim_output(out, kind, name, content):
             folder = first.with_name(f"{first.name}-{i}")
 
 
-def data_root(data, names, whole=False):
-    """The folder `data` or, if it is None, that of the simulated city.
+def data_root(data, names):
+    """The folder `data` or, if it is None, that of the simulated city, with the sequences `names`.
 
-    Missing sequences of the city are simulated: those in `names`, or all if `whole` is true. Raises
-    ValueError for a name that the city does not have.
+    Missing ones are simulated. Raises ValueError for a name that the city does not have.
     """
     if data:
         return Path(data)
-    names = kitti.expand_splits(names or ())
+    names = kitti.expand_splits(names)
     if unknown := set(names) - set(kitti.expand_splits("all")):
         raise ValueError(f"the simulated city has no sequence {' '.join(sorted(unknown))}; "
                          f"available: 00 to 10, {', '.join(SPLITS)}, all")
-    return kitti.simulate(SIMULATED, sequences="all" if whole else names)
+    return kitti.simulate(SIMULATED, sequences=names)
 
 
 def choose_sequences(root, names=None):
@@ -1106,21 +1110,16 @@ def choose_sequences(root, names=None):
                          f"{' '.join(available)}; choose those to train on with --sequences")
     chosen = kitti.open_sequences(root, names)
     names = [s.name for s in chosen]
-    if not sum(len(s) - 1 for s in chosen):
-        raise ValueError(f"{root}: sequence {' '.join(names)} has one scan; training needs at "
-                         "least two scans")
     return chosen, kitti.open_sequences(root, [n for n in held_out if n not in names])
 
 
 def training_facts(fingerprints, motions, records, earlier):
     """What a weights file stores about its training data.
 
-    fingerprints: of the sequences; motions, records: of each of them; earlier: the same facts about
-    earlier training data, if training starts from other weights, or {}. The mean motion is that of
-    the new data.
+    fingerprints, motions, records: of each sequence. earlier: these facts in the weights that
+    training starts from, or {}. The mean motion is that of the new data.
     """
-    stats = [r["stats"] for r in records]
-    stats = np.concatenate([*stats, np.reshape(earlier.get("seen", ()), (-1, len(kitti.STATS)))])
+    stats = np.vstack([*(r["stats"] for r in records), *earlier.get("seen", ())])
     return {"trained_on": sorted({*fingerprints, *earlier.get("trained_on", ())}),
             "mean_motion": to_vector(np.concatenate(motions)).mean(0).tolist(),
             "seen": [stats.min(0).tolist(), stats.max(0).tolist()]}
@@ -1131,11 +1130,11 @@ def read_run(run):
     try:
         content = json.loads((run / "config.json").read_text(encoding="utf-8"))
         config, arguments = Config(**content["config"]), content["arguments"]
-        data, sequences, seed, weights = (arguments[name] for name in
-                                          ("data", "sequences", "seed", "weights"))
-        check_number("seed", seed)
-        data, weights = (path and str(Path(path)) for path in (data, weights))
-        return config, data, [str(Path(name)) for name in sequences], seed, weights
+        require("seed", [arguments["seed"]], 0, 2**63 - 1)
+        texts = [*arguments["sequences"], arguments["data"] or "", arguments["weights"] or ""]
+        if not all(isinstance(text, str) for text in texts):
+            raise ValueError("damaged")
+        return config, *(arguments[name] for name in ("data", "sequences", "seed", "weights"))
     except (ValueError, KeyError, TypeError, AttributeError, OSError):
         raise ValueError(f"{run}/config.json: missing or damaged, so there is no training run to "
                          "resume; give its folder with --out") from None
@@ -1157,18 +1156,19 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     is not finite, and OSError if a file cannot be read or written.
     """
     check_device(device)
-    check_number("seed", seed)
     if resume:
-        config, data, sequences, seed, weights = read_run(Path(out or ""))
+        run = Path(out or "")
+        config, data, sequences, seed, weights = read_run(run)
     else:
         check_output(out, data or SIMULATED)
+    require("seed", [seed], 0, 2**63 - 1)
     config = config or (Config() if data else Config(**SHORT))
-    data, weights = (path and str(Path(path).resolve()) for path in (data, weights))
+    data, weights = (path and os.path.abspath(path) for path in (data, weights))
 
     # The network: as in the checkpoint, as in the weights, or with random weights
     torch.manual_seed(seed)
-    net, checkpoint, earlier = network(config), None, {}
-    if resume and (stored := Path(out) / "checkpoint.pt").exists():
+    net, checkpoint, earlier = build(network, config), None, {}
+    if resume and (stored := run / "checkpoint.pt").exists():
         with reading_weights(stored):
             checkpoint = earlier = read_archive(stored)
     elif weights:
@@ -1177,7 +1177,7 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
         net.config = replace(net.config, **settings)
 
     # The data. All scans are read, so that an unusable one is found now and not after the training
-    root = data_root(data, sequences, whole=True)
+    root = data_root(data, [*(sequences or ()), "all"])
     chosen, held_out = choose_sequences(root, sequences)
     motions, names = [s.motions() for s in chosen], [s.name for s in chosen]
     per_epoch = steps_per_epoch(sum(map(len, motions)), net.config)
@@ -1187,17 +1187,18 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     fingerprints = [s.fingerprint(records["crc"]) for s, records in zip(chosen, loaded)]
     facts = training_facts(fingerprints, motions, loaded[:len(chosen)], earlier)
     if checkpoint and checkpoint["trained_on"] != facts["trained_on"]:
-        raise ValueError(f"{out}: the data has changed since this training run started; resume it "
+        raise ValueError(f"{run}: the data has changed since this training run started; resume it "
                          "with the data it was started with")
 
-    arguments = dict(data=data, sequences=names, seed=seed, device=device, weights=weights)
+    arguments = dict(data=data, sequences=names, seed=int(seed), device=device, weights=weights)
     versions = kitti.versions(Path(__file__).parent) | {"d3dlo": __version__}
-    run = Path(out) if resume else claim_output(out, "runs", "config.json", {
-        "arguments": arguments, "config": net.config.as_dict(), "versions": versions})
+    if not resume:
+        run = claim_output(out, "runs", "config.json", {
+            "arguments": arguments, "config": net.config.as_dict(), "versions": versions})
 
     def say(line):
         """Print a line and append it to the log."""
-        with open(run / "log.txt", "a", encoding="utf-8") as file:
+        with open(run / "log.txt", "a", encoding="utf-8", errors="backslashreplace") as file:
             file.write(line + "\n")
         print(line, flush=True)
 
@@ -1205,7 +1206,8 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
         parameters = sum(p.numel() for p in net.parameters())
         say(f"{parameters:,} parameters, {sum(map(len, motions)):,} pairs of scans of "
             f"{' '.join(names)}, {net.config.epochs} epochs of {per_epoch} batches -> {run}")
-        if not sequences and (missing := set(SPLITS["train"]) - set(names)):
+        missing = set(SPLITS["train"]) - set(names)
+        if not sequences and 0 < len(missing) < len(SPLITS["train"]):
             say(f"missing from the training split: {' '.join(sorted(missing))}")
         fit(net, [*zip(loaded, motions)], run, test, seed, device, objective, checkpoint, say,
             **facts)
@@ -1215,7 +1217,7 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
             evaluate(root, run, [s.name for s in held_out], run / "results", device, say=say,
                      network=network)
     except KeyboardInterrupt:
-        advice = f"to continue: python d3dlo.py train --out {run} --resume"
+        advice = f"continue with `python d3dlo.py train --out {run} --resume`"
         raise KeyboardInterrupt(advice) from None
     say(f"weights       {run}/weights.pt\n"
         f"next          python d3dlo.py eval --weights {run}{f' --data {data}' * bool(data)}")
@@ -1235,17 +1237,18 @@ def command_line(argv):
     commands = parser.add_subparsers(dest="command", required=True, metavar="train | eval")
     both = argparse.ArgumentParser(add_help=False, argument_default=argparse.SUPPRESS)
     add = both.add_argument
-    add("--data", metavar="ROOT", help=(
+    add("--data", metavar="ROOT", type=os.path.expanduser, help=(
         "folder in KITTI odometry layout; for eval also a folder of scans (default: a simulated "
         f"city, made in {SIMULATED})"))
     add("--sequences", nargs="+", metavar="NN", help=(
         "names, or splits: train, test, validation, all (default for train: train; for eval: all, "
         "or test and validation of the simulated city)"))
-    add("--weights", metavar="FILE|RUN", help=(
+    add("--weights", metavar="FILE|RUN", type=os.path.expanduser, help=(
         "a weights file, or the folder of a training run (default for eval: the pretrained "
         "weights; train starts from these weights and keeps their network and input settings)"))
     add("--device", help="cpu, cuda or mps (default: cpu)")
-    add("--out", metavar="DIR", help="new folder to write (default: runs/TIME or results/TIME)")
+    add("--out", metavar="DIR", type=os.path.expanduser, help=(
+        "new folder to write (default: runs/TIME or results/TIME)"))
 
     add = commands.add_parser("train", parents=[both], **settings, help=(
         "train, then evaluate on the test and validation splits")).add_argument
@@ -1298,7 +1301,8 @@ def main(argv=None):
     command = args.pop("command")
     kitti.keep_freed_memory()
     kitti.treat_sigterm_as_interrupt()
-    try:
+
+    def work():
         if empty := [name for name, value in args.items() if value == ""]:
             raise ValueError(f"--{empty[0]} is empty; give a value, or leave the option out")
         if command == "eval":
@@ -1308,20 +1312,11 @@ def main(argv=None):
                              "only --out RUN and, if needed, --device")
         else:
             train(config_from(args), **args)
-    except KeyboardInterrupt as interrupt:
-        advice = str(interrupt) or f"run it again{', with a new --out' * ('out' in args)}"
-        print(f"\nd3dlo: interrupted; {advice}", file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        sys.stdout = open(os.devnull, "w")  # otherwise Python complains at exit
-        advice = ("; continue with `python d3dlo.py train --out RUN --resume`"
-                  if command == "train" else "")
-        print(f"d3dlo: standard output was closed{advice}", file=sys.stderr)
-        return 2
-    except (ValueError, OSError) as error:
-        print(f"d3dlo: {error}", file=sys.stderr)
-        return 2
-    return 0
+
+    advice = "run it again" + ", with a new --out" * ("out" in args)
+    if command == "train":
+        advice = "continue with `python d3dlo.py train --out RUN --resume`"
+    return metrics.run_command("d3dlo", work, advice)
 
 
 if __name__ == "__main__":

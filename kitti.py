@@ -33,7 +33,8 @@ import warnings
 import zlib
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
+from decimal import Decimal
 from pathlib import Path
 from typing import NamedTuple
 
@@ -41,7 +42,17 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from metrics import is_rigid, path_lengths, read_lines, read_poses, replacing, write_poses
+from metrics import (
+    is_rigid,
+    parse,
+    path_lengths,
+    read_lines,
+    read_poses,
+    replacing,
+    run_command,
+    step_errors,
+    write_poses,
+)
 
 # Section 4 of the paper
 SPLITS = {
@@ -54,6 +65,15 @@ SPLITS = {
 # Frames
 
 
+def rigid(R, t):
+    """Rotations (...,3,3) and translations (...,3) -> rigid transforms (...,4,4) float64."""
+    T = np.zeros((*R.shape[:-2], 4, 4))
+    T[..., :3, :3] = R
+    T[..., :3, 3] = t
+    T[..., 3, 3] = 1
+    return T
+
+
 def invert(T):
     """The inverses of rigid transforms (...,4,4): R^T and -R^T t for R and t.
 
@@ -61,11 +81,7 @@ def invert(T):
     """
     T = np.asarray(T, dtype=float)
     R_inverse = np.swapaxes(T[..., :3, :3], -1, -2)
-    out = np.zeros_like(T)
-    out[..., :3, :3] = R_inverse
-    out[..., :3, 3:] = -R_inverse @ T[..., :3, 3:]
-    out[..., 3, 3] = 1
-    return out
+    return rigid(R_inverse, (-R_inverse @ T[..., :3, 3:])[..., 0])
 
 
 def camera_to_velo(T_cam, Tr):
@@ -97,19 +113,17 @@ def to_vector(T: np.ndarray) -> np.ndarray:
 def from_vector(v: np.ndarray) -> np.ndarray:
     """The inverse of `to_vector`: (...,6) in metres and degrees -> (...,4,4) float64."""
     v = np.asarray(v, dtype=float)
-    flat = v.reshape(-1, 6)
-    T = np.tile(np.eye(4), (len(flat), 1, 1))
-    T[:, :3, :3] = Rotation.from_euler("xyz", flat[:, 3:], degrees=True).as_matrix()
-    T[:, :3, 3] = flat[:, :3]
-    return T.reshape(*v.shape[:-1], 4, 4)
+    R = Rotation.from_euler("xyz", v[..., 3:].reshape(-1, 3), degrees=True).as_matrix()
+    return rigid(R.reshape(*v.shape[:-1], 3, 3), v[..., :3])
 
 
 # ------------------------------------------------------------------------------------------------
 # Scans, calibration and sequences
 
-FIVE_FLOATS = ("nuScenes files have five floats per point: convert each with "
-               "np.save(NEW, np.fromfile(OLD, np.float32).reshape(-1, 5)[:, :4])")
 OTHER_FORMATS = b"\x93NUMPY", b"ply\n", b"ply\r", b"# .PCD"  # how files of other formats begin
+OTHER_COLUMNS = {  # what else a .bin file may hold: NumPy type, number of columns
+    "five floats per point, as in nuScenes": ("float32", 5), "float64": ("float64", 4),
+    "six floats per point": ("float32", 6), "eight floats per point": ("float32", 8)}
 
 
 def _check_size(path, size=None):
@@ -118,20 +132,32 @@ def _check_size(path, size=None):
     if size == 0 or size % 16:
         raise ValueError(f"{path} has {size} bytes, but a scan has 16 (four float32) per point: "
                          "if it is truncated, copy or unpack it again; if it has other columns, "
-                         f"save x, y, z, intensity as .npy. {FIVE_FLOATS}.")
+                         "five floats per point as in nuScenes for example, convert it with "
+                         "np.save(NEW, np.fromfile(OLD, 'float32').reshape(-1, 5)[:, :4]).")
+
+
+def _is_scan(points):
+    """Whether the columns of points (N,4+) look like x, y, z [m] and intensity, 0 to 1 or to 255.
+
+    One point in a hundred may be anything.
+    """
+    with np.errstate(invalid="ignore"):  # NaN does not count against a scan
+        odd = (np.abs(points[:, :3]) > 1e5).any(1) | (points[:, 3] > 255) | (points[:, 3] < -0.01)
+    return np.count_nonzero(odd) <= len(points) / 100
 
 
 def read_scan(path: str | Path, intensity_max: float = 1) -> np.ndarray:
     """Read one scan, a .bin or .npy file.
 
     Returns (N,4) float32: x, y, z [m] in the LiDAR's frame, and the intensity divided by
-    `intensity_max`. NaN is kept. A .bin file holds four float32 per point, like KITTI's. A .npy
-    file holds an array (N,3) or (N,4); without a fourth column the intensities are 0. Raises
-    OSError if the file cannot be read, and ValueError if it is empty, damaged or of another format.
+    `intensity_max` and clipped to 0..1. NaN is kept. A .bin file holds four float32 per point, like
+    KITTI's. A .npy file holds an array (N,3) or (N,4); without a fourth column the intensities are
+    0. Raises OSError if the file cannot be read, and ValueError if it is empty, damaged or of
+    another format, with what it looks like.
     """
     path = Path(path)
     if path.suffix == ".npy":
-        points = _read_npy(path)
+        points, data = _read_npy(path), b""
     else:
         data = path.read_bytes()
         if data.startswith(OTHER_FORMATS):
@@ -142,7 +168,17 @@ def read_scan(path: str | Path, intensity_max: float = 1) -> np.ndarray:
     scan = np.zeros((len(points), 4), np.float32)
     with np.errstate(over="ignore"):  # numbers too large for float32 become infinite
         scan[:, :points.shape[1]] = points
-    scan[:, 3] /= intensity_max
+    if not _is_scan(scan):
+        advice = "save these columns as float32"
+        for kind, (dtype, columns) in OTHER_COLUMNS.items():
+            numbers = np.frombuffer(data[:len(data) // 8 * 8], dtype)
+            if len(data) and len(numbers) % columns == 0 and _is_scan(numbers.reshape(-1, columns)):
+                advice = (f"it looks like {kind}; convert it with np.save(NEW, np.fromfile(OLD, "
+                          f"'{dtype}').reshape(-1, {columns})[:, :4])")
+                break
+        raise ValueError(f"{path} does not hold x, y, z [m] and intensities of 0 to 1 or 0 to 255: "
+                         f"{advice}.")
+    scan[:, 3] = np.clip(scan[:, 3] / intensity_max, 0, 1)
     return scan
 
 
@@ -162,15 +198,15 @@ def _read_npy(path):
 
 
 def scans_in(folder):
-    """The *.bin and *.npy files of a folder, in natural order (2 before 10): list of paths.
+    """The *.bin and *.npy files of a folder in their order: list of paths, without hidden files.
 
-    Hidden files are ignored.
+    Names that are all one number, such as times, are sorted by value, 0.9 before 0.95. All others
+    are in natural order, 2 before 10.
     """
-    def with_padded_numbers(path):
-        return re.sub(r"\d+", lambda digits: digits[0].zfill(20), path.name)
-
     paths = [path for path in Path(folder).glob("[!.]*") if path.suffix in (".bin", ".npy")]
-    return sorted(paths, key=with_padded_numbers)
+    if all(re.fullmatch(r"\d+(\.\d+)?", path.stem) for path in paths):
+        return sorted(paths, key=lambda path: Decimal(path.stem))
+    return sorted(paths, key=lambda path: re.sub(r"\d+", lambda n: n[0].zfill(20), path.name))
 
 
 def read_calib(path: str | Path) -> np.ndarray:
@@ -194,10 +230,7 @@ def read_calib(path: str | Path) -> np.ndarray:
 def _calib_row(path, name, count):
     """The numbers (count,) of row `name` in a calibration file, NaN if there is no such row."""
     rows = [words[1:] for _, words in read_lines(path) if words[0] == f"{name}:"]
-    try:
-        return np.array(rows[0], dtype=float).reshape(count)
-    except (IndexError, ValueError):
-        return np.full(count, np.nan)
+    return parse(rows[0] if rows else [], count)
 
 
 def write_tum(path: str | Path, T: np.ndarray, times: np.ndarray) -> None:
@@ -229,6 +262,9 @@ class Sequence:
     def __init__(self, folder, truth=None):
         self.folder, self.name = Path(folder), Path(os.path.abspath(folder)).name
         self.scan_paths = scans_in(self.folder / "velodyne" if truth else folder)
+        if not self.scan_paths:
+            raise FileNotFoundError(f"{folder} holds no scans, *.bin or *.npy; KITTI's are in "
+                                    "data_odometry_velodyne.zip.")
         self.Tr = self.poses_cam = self.poses = None
         self.intensity_max, self.notes = 1, []
         if truth:
@@ -238,15 +274,13 @@ class Sequence:
 
     def _open_kitti(self, truth):
         """Check the scans; read calib.txt and, if it exists, the ground truth."""
-        if not self.scan_paths:
-            raise FileNotFoundError(f"{self.folder / 'velodyne'} holds no scans: unpack "
-                                    "data_odometry_velodyne.zip; the other archives hold none.")
         for i, path in enumerate(self.scan_paths):
             if path.name != f"{i:06d}.bin":
                 raise ValueError(f"{path.parent} should hold {i:06d}.bin next but holds "
                                  f"{path.name}: scans are numbered from 000000 without a gap; "
                                  "unpack data_odometry_velodyne.zip again.")
             _check_size(path)
+        self._scale_intensities()
         self.Tr = read_calib(self.folder / "calib.txt")
         if not truth.exists():
             return
@@ -256,6 +290,10 @@ class Sequence:
                              f"{len(self)} scans: the numbers must agree; unpack the incomplete "
                              "archive again.")
         self.poses = camera_to_velo(self.poses_cam, self.Tr)  # (n,4,4)
+        metres, degrees = step_errors(np.tile(np.eye(4), (len(self), 1, 1)), self.poses).T
+        for i in np.flatnonzero((metres > 10) | (degrees > 45))[:1]:
+            self.notes.append(f"{truth}, from line {i + 1} to {i + 2}: a step of {metres[i]:.1f} m "
+                              f"and {degrees[i]:.0f} deg; if it is wrong, correct the file")
 
     def _open_folder(self):
         """Check the scans; set intensity_max and times, and note what was assumed."""
@@ -266,52 +304,49 @@ class Sequence:
             if path.suffix == ".bin":
                 _check_size(path)
 
-        # Missing scans of a folder that is numbered consecutively
-        if all(path.stem.isdecimal() for path in self.scan_paths):
-            steps = np.diff([int(path.stem) for path in self.scan_paths])
-            gaps = np.flatnonzero(steps > 1)
-            if len(gaps) and np.median(steps) == 1:  # other numbers, such as times, have no gaps
-                self.notes.append(f"{(steps - 1).sum()} scans are missing, the first after "
-                                  f"{self.scan_paths[gaps[0]].name}; the motion across a gap may "
-                                  "be wrong")
-
-        # Intensities 0 to 1 or 0 to 255, judged by ten scans spread over the folder
-        largest = 0
-        for i in np.unique(np.linspace(0, len(self) - 1, 10).astype(int)):
-            intensity = self.scan(i)[:, 3]
-            intensity = intensity[np.isfinite(intensity)]
-            low, high = intensity.min(initial=0), intensity.max(initial=0)
-            if low < 0:
-                raise ValueError(f"{self.scan_paths[i]}: the fourth value of a point is {low:.4g}, "
-                                 "but intensities are not negative, so this is not x, y, z, "
-                                 f"intensity. {FIVE_FLOATS}.")
-            if high > 255:
-                raise ValueError(f"{self.scan_paths[i]} has intensities up to {high:.4g}, but they "
-                                 "must lie within 0..1 or 0..255: rescale those of all scans.")
-            largest = max(largest, high)
-        if largest > 1:
-            self.intensity_max = 255
-            self.notes.append(f"intensities reach {largest:.4g}; all are divided by 255")
-        if largest == 0:
-            self.notes.append("there are no intensities; zeros are used, so expect larger errors")
-
+        numbers = [re.findall(r"\d+(?:\.\d+)?", path.stem) for path in self.scan_paths]
+        for column in zip(*numbers):  # the first numbers in the names, the second ...
+            self._note_gaps(np.array(column, float), "file names")
+        self._scale_intensities()
         if (self.folder / "times.txt").exists():
             self.times = self._read_times(self.folder / "times.txt")
+            self._note_gaps(self.times, "times.txt")
         else:
             self.times = 0.1 * np.arange(len(self))
             self.notes.append("no times.txt (one time in seconds per line); "
                               "10 scans a second are assumed")
 
+    def _note_gaps(self, numbers, source):
+        """Note steps of increasing numbers (n,) that are above 1.5 times the median step."""
+        steps = np.diff(numbers)
+        if len(steps) > 1 and (steps > 0).all() and (gaps := steps > 1.5 * np.median(steps)).any():
+            missing = (np.round(steps[gaps] / np.median(steps)) - 1).clip(1).sum()
+            self.notes.append(f"{missing:.0f} scans are missing by the {source}, the first after "
+                              f"{self.scan_paths[gaps.argmax()].name}; the motion across a gap may "
+                              "be wrong")
+
+    def _scale_intensities(self):
+        """Set intensity_max to 255 if more than 1 % of the points of ten scans are above 1."""
+        chosen = np.unique(np.linspace(0, len(self) - 1, 10).astype(int))
+        scans = [read_scan(self.scan_paths[i], 255) for i in chosen]
+        intensity = 255 * np.concatenate(scans)[:, 3]
+        if np.count_nonzero(intensity > 1.001) > len(intensity) / 100:
+            self.intensity_max = 255
+            self.notes.append(f"intensities reach {np.nanmax(intensity):.4g}; all are divided by "
+                              "255")
+        if not (intensity > 0).any():
+            self.notes.append("there are no intensities; zeros are used, so expect larger errors")
+
     def _read_times(self, path):
         """The times (n,) [s] in a times.txt, one per line."""
-        try:
-            times = np.array([words[0] for _, words in read_lines(path)], dtype=float)
-        except ValueError:
-            times = np.empty(0)
-        if len(times) != len(self) or not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
+        times = parse([words[0] for _, words in read_lines(path)], len(self))
+        if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
             raise ValueError(f"{path} must hold {len(self)} increasing numbers, the time of each "
                              "scan in seconds: correct it, or remove it to assume 10 scans a "
                              "second.")
+        if len(times) > 1 and np.median(np.diff(times)) > 60:
+            raise ValueError(f"{path} has steps of {np.median(np.diff(times)):.4g}, which cannot "
+                             "be seconds: divide nanoseconds by 1e9, for example.")
         return times
 
     def __len__(self):
@@ -344,11 +379,9 @@ class Sequence:
 
 def expand_splits(names):
     """Names of sequences and splits, or one of them -> names of sequences, each once, in order."""
-    expanded = {}  # a dict keeps the order
-    for name in [names] if isinstance(names, str) else names:
-        members = sum(SPLITS.values(), ()) if name == "all" else SPLITS.get(name, (name,))
-        expanded |= dict.fromkeys(members)
-    return list(expanded)
+    names = [names] if isinstance(names, str) else names
+    groups = SPLITS | {"all": sum(SPLITS.values(), ())}
+    return list(dict.fromkeys(member for name in names for member in groups.get(name, (name,))))
 
 
 def sequence_names(root: str | Path) -> list[str]:
@@ -406,7 +439,8 @@ def open_sequences(root: str | Path, names: str | list[str] = "all") -> list[Seq
 # ------------------------------------------------------------------------------------------------
 # From a scan to a point cloud
 
-MAX_VALID_RANGE, MAX_VALID_INTENSITY = 1000.0, 65536  # the first in m; no LiDAR returns more
+MIN_VALID_RANGE, MAX_VALID_RANGE = 0.1, 1000.0  # [m]; many LiDARs store (0, 0, 0) for no return
+MAX_VALID_INTENSITY = 65536  # no LiDAR returns more
 # Scan statistics, used to warn about domain shift
 STATS = ("usable points", "mean intensity", "median range of the centroids [m]",
          "share of points in the densest 0.3 m of height (the ground)")
@@ -416,12 +450,16 @@ def usable_points(scan, max_range=None, plane=True):
     """Select the points of a scan that the network uses, and count the invalid ones.
 
     (N,4) -> (M,4) float32, in the same order, and a number. Invalid points are dropped first: those
-    that are not finite, or whose range or intensity is too large for a LiDAR. Then points beyond
+    that are not finite, or whose range or intensity is too large for a LiDAR. So are points closer
+    than MIN_VALID_RANGE, where the laser saw nothing; they are not counted. Then points beyond
     `max_range` metres are dropped (None: keep all). If `plane` is False, the ground plane is
-    removed last. Raises ValueError for a shape other than (N,4).
+    removed last. Raises ValueError for anything but an array of numbers (N,4).
     """
+    scan = np.asarray(scan)
+    if scan.dtype.kind not in "fiu":
+        raise ValueError(f"a scan is an array of numbers (N, 4), not of type {scan.dtype}")
     with np.errstate(over="ignore", invalid="ignore"):
-        scan = np.asarray(scan, np.float32)
+        scan = scan.astype(np.float32, copy=False)
         if scan.ndim != 2 or scan.shape[1] != 4:
             raise ValueError(f"a scan has the shape (N, 4), not {scan.shape}; give x, y, z [m] and "
                              "intensity for N points, zeros if there are no intensities")
@@ -429,7 +467,8 @@ def usable_points(scan, max_range=None, plane=True):
         squared_range = x * x + y * y + z * z
         # A comparison with NaN is false
         valid = (squared_range < MAX_VALID_RANGE**2) & (np.abs(intensity) < MAX_VALID_INTENSITY)
-        near = squared_range < (max_range or MAX_VALID_RANGE) ** 2
+        near = ((squared_range < (max_range or MAX_VALID_RANGE) ** 2)
+                & (squared_range >= MIN_VALID_RANGE**2))
     kept = scan[valid & near]  # (M,4)
     return kept if plane else remove_plane(kept), np.count_nonzero(~valid)
 
@@ -513,6 +552,9 @@ def progress(items, total, what):
     On a terminal the line is rewritten in place. Elsewhere a line is printed every 10 s at first,
     and then at intervals of a tenth of the elapsed time.
     """
+    if not sys.stderr:  # started without one
+        yield from items
+        return
     tty = sys.stderr.isatty()
     began, done = time.monotonic(), 0
     due = began + (0.2 if tty else 10)  # time of the next message [s]
@@ -551,7 +593,7 @@ def in_processes(function, tasks, workers=None, chunksize=4):
     """
     if not tasks:
         return
-    pool = ProcessPoolExecutor(workers or cores(), initializer=_leave_signals_to_parent)
+    pool = ProcessPoolExecutor(workers or cores(), initializer=_obey, initargs=(os.getpid(),))
     try:
         yield from pool.map(function, tasks, chunksize=chunksize)
     except BrokenExecutor:
@@ -562,10 +604,17 @@ def in_processes(function, tasks, workers=None, chunksize=4):
         pool.shutdown(cancel_futures=True)
 
 
-def _leave_signals_to_parent():
-    """Make a worker ignore Ctrl-C, which the parent handles, and end at SIGTERM."""
+def _obey(parent):
+    """Make a worker ignore Ctrl-C, which the parent handles, and end at SIGTERM or with the parent.
+    """
+    def end_with_parent():
+        while os.getppid() == parent:
+            time.sleep(1)
+        os._exit(1)
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    threading.Thread(target=end_with_parent, daemon=True).start()
 
 
 def treat_sigterm_as_interrupt():
@@ -580,12 +629,10 @@ def keep_freed_memory():
     Otherwise every allocation causes new page faults, which cost a third of a training step's time
     on a CPU.
     """
-    try:
+    with suppress(OSError, AttributeError, TypeError):  # another C library
         libc = ctypes.CDLL(None)
         libc.mallopt(-4, 0)  # M_MMAP_MAX: large blocks come from the heap too
         libc.mallopt(-1, 2**31 - 1)  # M_TRIM_THRESHOLD: the heap never shrinks
-    except (OSError, AttributeError, TypeError):  # another C library
-        pass
 
 
 def versions(folder):
@@ -637,12 +684,10 @@ def _load(file, dtype, n):
     """The records (n,) in a cache file, or None. Reports a damaged file."""
     if not file.is_file():
         return None
-    try:
+    with suppress(Exception):  # np.load raises many exception types; all mean a corrupt file
         records = np.load(file, mmap_mode="r")  # pickles are off by default, so no code runs
         if (records.dtype, records.shape) == (dtype, (n,)):
             return records
-    except Exception:  # np.load raises many exception types; all of them mean a corrupt file
-        pass
     print(f"{file}: damaged, so it is computed again", file=sys.stderr)
     return None
 
@@ -663,11 +708,6 @@ def new_folder(path):
 # KITTI's raw drives: readme.txt of the raw data devkit, and oxts/dataformat.txt of each drive
 
 EARTH_RADIUS = 6378137.0  # [m]; devkit: latlonToMercator.m
-# Columns of a GPS/IMU packet
-LAT_LON_ALT = slice(0, 3)  # degrees, degrees, m
-ROLL_PITCH_YAW = slice(3, 6)  # rad
-VELOCITY = [7, 6, 10]  # m/s to the east, to the north and upwards
-ANGULAR_VELOCITY = slice(17, 20)  # rad/s about the unit's x, y and z axes
 MAX_DELAY = np.timedelta64(100, "ms")  # a scan farther from every packet has no pose
 SECOND = np.timedelta64(1, "s")
 
@@ -773,10 +813,7 @@ def _raw_stream(folder, suffix):
 
 def _read_packet(path):
     """Read a GPS/IMU packet: (30,) numbers in the order of oxts/dataformat.txt."""
-    try:
-        packet = np.array(path.read_bytes().split(), dtype=float).reshape(30)
-    except ValueError:
-        packet = np.full(30, np.nan)
+    packet = parse(path.read_bytes().split(), 30)
     if not np.isfinite(packet).all():
         raise ValueError(f"{path} is damaged: a GPS/IMU packet is 30 finite numbers; "
                          "unpack the drive again.")
@@ -811,19 +848,17 @@ def _imu_poses(packets, delay):
     taken as constant. The unit then moves along an arc, whose chord has the direction of the
     velocity half-way.
     """
-    lat, lon, alt = packets[:, LAT_LON_ALT].T
+    lat, lon, alt = packets[:, :3].T  # (n,) each; degrees, degrees, m
+    velocity = packets[:, [7, 6, 10]]  # (n,3) m/s, to the east, to the north and upwards
+    turn_rate = packets[:, 17:20]  # (n,3) rad/s, about the unit's x, y and z axes
     scale = EARTH_RADIUS * np.cos(np.radians(lat[0]))
     east = scale * np.radians(lon)
     north = scale * np.log(np.tan(np.radians(90 + lat) / 2))
-    attitude = Rotation.from_euler("xyz", packets[:, ROLL_PITCH_YAW])
-    # Rotation vectors along the axes of the world (n,3)
-    turn = attitude.apply(packets[:, ANGULAR_VELOCITY]) * delay[:, None]
+    attitude = Rotation.from_euler("xyz", packets[:, 3:6])  # roll, pitch, yaw [rad]
+    turn = attitude.apply(turn_rate) * delay[:, None]  # (n,3), about the axes of the world
     half_turn = Rotation.from_rotvec(turn / 2)
-    T = np.tile(np.eye(4), (len(packets), 1, 1))  # (n,4,4)
-    T[:, :3, :3] = (Rotation.from_rotvec(turn) * attitude).as_matrix()
-    T[:, :3, 3] = np.stack([east, north, alt], axis=1)
-    T[:, :3, 3] += half_turn.apply(packets[:, VELOCITY] * delay[:, None])
-    return T
+    position = np.stack([east, north, alt], axis=1) + half_turn.apply(velocity * delay[:, None])
+    return rigid((Rotation.from_rotvec(turn) * attitude).as_matrix(), position)
 
 
 # ------------------------------------------------------------------------------------------------
@@ -1743,7 +1778,8 @@ def _command_line(argv):
 
     add = commands.add_parser("simulate", help=(
         "make simulated drives, with ground truth")).add_argument
-    add("dir", metavar="DIR", help="folder to write, in KITTI's odometry layout")
+    add("dir", metavar="DIR", type=os.path.expanduser, help=(
+        "folder to write, in KITTI's odometry layout"))
     add("--seed", type=int, metavar="N", default=0, help=(
         "random seed; another seed gives other cities (default: 0)"))
     add("--sequences", nargs="+", metavar="NN", default=["all"], help=(
@@ -1755,9 +1791,10 @@ def _command_line(argv):
 
     add = commands.add_parser("raw", help=(
         "convert a drive of KITTI's raw data, with ground truth")).add_argument
-    add("drive", metavar="DRIVE", help=(
+    add("drive", metavar="DRIVE", type=os.path.expanduser, help=(
         "unpacked folder such as 2011_09_26/2011_09_26_drive_0013_sync"))
-    add("dir", metavar="ROOT", help="folder to write, in KITTI's odometry layout")
+    add("dir", metavar="ROOT", type=os.path.expanduser, help=(
+        "folder to write, in KITTI's odometry layout"))
     return parser.parse_args(argv)
 
 
@@ -1765,28 +1802,22 @@ def main(argv=None):
     """The command line -> exit code: 0, 2 for bad input, 130 when interrupted."""
     args = _command_line(argv)
     treat_sigterm_as_interrupt()
-    try:
+
+    def work():
         if args.command == "raw":
             parts = convert_raw(args.drive, args.dir)
             made = open_sequences(args.dir, list(parts))
         else:
             simulate(args.dir, args.seed, args.sequences, args.scans, args.azimuth)
             made = open_sequences(args.dir, args.sequences)
-    except (ValueError, OSError) as error:
-        message = " ".join(str(error).split())  # in one line
-        print(f"kitti.py: {message}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("kitti.py: interrupted; complete sequences are kept, run the same command again for "
-              "the rest", file=sys.stderr)
-        return 130
-    print(f"{args.dir}: {len(made)} sequences, {sum(map(len, made)):,} scans")
-    if args.command == "raw":
-        for s, (first, last) in zip(made, parts.values()):
-            print(f"{s.name}: scans {first} to {last}, {path_lengths(s.poses)[-1]:.1f} m")
-        if len(made) > 1:
-            print("The drive is split where scans or their GPS/IMU packets are missing.")
-    return 0
+        print(f"{args.dir}: {len(made)} sequences, {sum(map(len, made)):,} scans")
+        if args.command == "raw":
+            for s, (first, last) in zip(made, parts.values()):
+                print(f"{s.name}: scans {first} to {last}, {path_lengths(s.poses)[-1]:.1f} m")
+            if len(made) > 1:
+                print("The drive is split where scans or their GPS/IMU packets are missing.")
+
+    return run_command("kitti.py", work, "complete sequences are kept, run it again for the rest")
 
 
 if __name__ == "__main__":

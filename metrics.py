@@ -125,12 +125,17 @@ def rmse(errors):
     return float(np.sqrt(np.mean(np.square(errors)))) if len(errors) else float("nan")
 
 
+def relative_to_first(T):
+    """Poses (n,4,4) -> the same in the frame of the first one."""
+    return np.linalg.inv(T[0]) @ T
+
+
 def absolute_error(T_gt: np.ndarray, T_est: np.ndarray) -> float:
-    """ATE [m]: RMSE of the positions, without any alignment. Two trajectories (n,4,4).
+    """ATE [m]: RMSE of the positions, with the first poses aligned. Two trajectories (n,4,4).
 
     Raises ValueError if the shapes differ.
     """
-    T_gt, T_est = _same_shape(T_gt, T_est)
+    T_gt, T_est = map(relative_to_first, _same_shape(T_gt, T_est))
     return rmse(np.linalg.norm(T_gt[:, :3, 3] - T_est[:, :3, 3], axis=1))
 
 
@@ -143,8 +148,8 @@ COLUMNS = {  # key of a summary: header, digits after the point
     "ate_m": ("ATE [m]", 3), "rpe_m": ("RPE [m]", 4), "rpe_deg": ("RPE [deg]", 4)}
 UNITS = """\
 E_t, E_r: KITTI devkit, mean over segments of 100 to 800 m of path. t step, r step: mean error per
-step. ATE, RPE: RMSE without alignment, RPE over one frame, as `evo_ape kitti` and `evo_rpe kitti`
-print by default; for RPE [deg] give evo_rpe -r angle_deg.
+step. ATE: RMSE with the first poses aligned, as `evo_ape kitti --align_origin`. RPE: RMSE over one
+frame, as `evo_rpe kitti` prints by default; for RPE [deg] give -r angle_deg.
 All in the frame of the files; KITTI's is the rectified left camera."""
 
 
@@ -199,8 +204,8 @@ def replacing(path):
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
-        if error.filename is None and error.strerror:  # such as for a full disk
-            raise OSError(error.errno, error.strerror, str(path)) from None
+        if error.filename is None:  # such as for a full disk
+            raise OSError(f"{path}: could not be written ({error.strerror or error})") from None
         raise
     finally:
         temporary.unlink(missing_ok=True)
@@ -229,6 +234,19 @@ def read_lines(path):
     return [(number, line.split()) for number, line in lines if line.strip()]
 
 
+COLUMN_HINTS = {8: "a line of 8 is that of a TUM file, t x y z qx qy qz qw",
+                13: "a line of 13 may begin with a number or time, to be cut off",
+                16: "a line of 16 is a whole 4x4 matrix, of which the last row is to be cut off"}
+
+
+def parse(words, n):
+    """The n numbers that a list of words spells (n,); NaN if they are not n numbers."""
+    try:
+        return np.array(words, dtype=float).reshape(n)
+    except ValueError:
+        return np.full(n, np.nan)
+
+
 def read_poses(path: str | Path) -> np.ndarray:
     """Read a KITTI pose file.
 
@@ -241,13 +259,11 @@ def read_poses(path: str | Path) -> np.ndarray:
         raise ValueError(f"{path}: holds no pose; give a KITTI pose file, 12 numbers a line")
     T = np.tile(np.eye(4), (len(lines), 1, 1))  # (n,4,4)
     for pose, (number, words) in zip(T, lines):
-        try:
-            pose[:3] = np.array(words, float).reshape(3, 4)
-        except ValueError:
-            pose[:] = np.nan
+        pose[:3] = parse(words, 12).reshape(3, 4)
         if not np.isfinite(pose).all():
+            hint = COLUMN_HINTS.get(len(words), "correct the line")
             raise ValueError(f"{path}, line {number}: {len(words)} words, but a KITTI pose is 12 "
-                             "finite numbers; correct the line")
+                             f"finite numbers; {hint}")
     rigid = is_rigid(T)
     if not rigid.all():
         raise ValueError(f"{path}: pose {np.argmin(rigid)} (counted from 0) is not a rigid motion; "
@@ -313,27 +329,28 @@ def draw(path, trajectories):
     Each name is a row: the path from above and, if there is any ground truth, KITTI's errors by
     segment length. Raises ValueError without matplotlib, and OSError if writing fails.
     """
-    any_truth = any(T_gt is not None for T_gt, _ in trajectories.values())
-    columns = 3 if any_truth else 1
+    columns = 3 if any(T_gt is not None for T_gt, _ in trajectories.values()) else 1
     figure = new_figure(3.5 * columns, 3.1 * len(trajectories))
     rows = figure.subplots(len(trajectories), columns, squeeze=False)
     for (name, (T_gt, T_est)), (above, *errors) in zip(trajectories.items(), rows):
+        name = name.encode("utf-8", "replace").decode()  # file names can hold any bytes
+        lengths = by_length([] if T_gt is None else [segment_errors(T_gt, T_est)])
+        T_gt, T_est = (T if T is None else relative_to_first(T) for T in (T_gt, T_est))
         view, right, forward = view_from_above(T_est if T_gt is None else T_gt)
         if T_gt is not None:
             above.plot(*view @ T_gt[:, :3, 3].T, color="0.65", lw=4, label="truth")
         above.plot(*view @ T_est[:, :3, 3].T, color="black", lw=1.2, label="estimate")
         above.plot(0, 0, "ko", ms=5)
-        above.set(title=f"{name} from above, from the dot", xlabel=right, ylabel=forward,
-                  aspect="equal", adjustable="datalim")
+        above.set_title(f"{name} from above, from the dot", parse_math=False)  # a $ is a $
+        above.set(xlabel=right, ylabel=forward, aspect="equal", adjustable="datalim")
         above.legend(frameon=False)
-        lengths = by_length([] if T_gt is None else [segment_errors(T_gt, T_est)])
         for axis, key, unit in zip(errors, ("E_t", "E_r"), ("%", "deg/m")):
             values = [s[key] for s in lengths.values()]
             axis.plot([int(length.split()[0]) for length in lengths], values, "ko-")
             if not lengths:
                 axis.text(450, 0.5, "no segment", ha="center")
-            axis.set(title=f"{name}: {key} by length", xlabel="length of the segments [m]",
-                     ylabel=f"{key} [{unit}]", xlim=(50, 850),
+            axis.set_title(f"{name}: {key} by length", parse_math=False)
+            axis.set(xlabel="length of the segments [m]", ylabel=f"{key} [{unit}]", xlim=(50, 850),
                      ylim=(0, 1.15 * max(values, default=0) or 1))
     for axis in rows.flat:
         axis.grid(color="0.9")
@@ -343,6 +360,29 @@ def draw(path, trajectories):
 
 # ------------------------------------------------------------------------------------------------
 # The command line
+
+
+def run_command(name, work, advice="run it again"):
+    """Call work(). Returns the exit code: 0, 2 for bad input, 130 when interrupted.
+
+    An error is printed in one line on stderr. advice: what to do after an interruption.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # print characters that a terminal lacks as escapes
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        work()
+        print(end="", flush=True)
+        return 0
+    except KeyboardInterrupt as interrupt:
+        print(f"\n{name}: interrupted; {str(interrupt) or advice}", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        sys.stdout = open(os.devnull, "w")  # otherwise Python complains at exit
+        print(f"{name}: standard output was closed; {advice}", file=sys.stderr)
+    except (ValueError, OSError) as error:
+        print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
+    return 2
 
 
 def _pairs_of_files(gt, est):
@@ -364,8 +404,7 @@ def _compare(gt, est, picture=None):
     """Compare pose files or folders. Returns the text to print; draws the picture, if any."""
     pairs = _pairs_of_files(gt, est)
     if picture and (picture.suffix not in PICTURES
-                    or picture.resolve() in [path.resolve() for pair in pairs.values()
-                                             for path in pair]):
+                    or picture.resolve() in (gt.resolve(), est.resolve())):
         raise ValueError(f"--plot {picture}: give the name of a new {', '.join(PICTURES)} file")
     trajectories, segments, steps, rows = {}, [], [], []
     for name, (gt, est) in pairs.items():
@@ -381,6 +420,10 @@ def _compare(gt, est, picture=None):
     if len(rows) > 1:
         rows.append(("all", summary(segments, steps)))
     rows += by_length(segments).items()
+    if any(view_from_above(T_gt)[1] != view_from_above(T_est)[1] for T_gt, T_est in
+           trajectories.values()):
+        print("the trajectories seem to be in different frames, a camera's and a LiDAR's; "
+              "kitti.velo_to_camera converts them", file=sys.stderr)
     if picture:
         draw(picture, trajectories)
     return "\n".join([table(rows), UNITS, *([str(picture)] if picture else [])])
@@ -390,20 +433,16 @@ def main(argv=None):
     """Run the command line. Returns the exit code: 0, or 2 for bad input."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("gt", metavar="GT", type=Path, help=(
+    path = dict(type=lambda text: Path(text).expanduser())
+    parser.add_argument("gt", metavar="GT", **path, help=(
         "ground truth: a pose file, or a folder of NN.txt"))
-    parser.add_argument("est", metavar="EST", type=Path, help=(
+    parser.add_argument("est", metavar="EST", **path, help=(
         "estimate: a pose file, or a folder of NN.txt"))
-    parser.add_argument("--plot", metavar="FILE", type=Path, help=(
+    parser.add_argument("--plot", metavar="FILE", **path, help=(
         "draw the paths and the errors by segment length into a .png, .pdf or .svg file; "
         "needs matplotlib"))
     args = parser.parse_args(argv)
-    try:
-        print(_compare(args.gt, args.est, args.plot))
-    except (ValueError, OSError) as error:
-        print(f"metrics.py: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return run_command("metrics.py", lambda: print(_compare(args.gt, args.est, args.plot)))
 
 
 if __name__ == "__main__":
