@@ -1339,7 +1339,8 @@ CASES = [  # commands, and {what the message must say: what spoils good data}
     (["eval --data drive --weights w.pt"], {
         "both .bin and .npy files: move": put("drive/0.bin", bytes(16)),
         "1.npy does not hold.* 0 to 255.*save": put(NPY, np.full((9, 4), 300)),
-        "1.npy does not hold.*float32": put(NPY, np.full((9, 4), -0.5)), "is damaged.*save": put(NPY, b"damaged"),
+        "1.npy does not hold.*float32": put(NPY, np.full((9, 4), -0.5)),
+        "is damaged.*save": put(NPY, b"damaged"),
         r"1.npy.*\(9, 5\).*save": put(NPY, np.ones((9, 5))),
         "1.npy.*save": put(NPY, np.array(Mischief())), "must hold 12": put(TIMES, b"1 2 3"),
         "increasing.*correct": put(TIMES, b"1\n" * 12),
@@ -1415,6 +1416,147 @@ def test_python_in_the_documentation_runs_and_its_commands_parse(cwd, monkeypatc
             with pytest.raises(SystemExit, match="parsed"):
                 runpy.run_path(str(HERE / script), run_name="__main__")
     assert len(commands) > 20 or not benchmarks.exists()
+
+
+# ------------------------------------------------------------------------------------------------
+# Every kind of input that people bring
+
+
+@pytest.mark.parametrize("dtype, columns, kind", [
+    ("float32", 5, "five floats"), ("float64", 4, "float64"), ("float32", 6, "six floats")])
+@given(seed=SEED)
+@settings(max_examples=5)
+def test_other_columns_are_named_with_a_remedy_that_works(tmp_path, dtype, columns, kind, seed):
+    scan, rings = random_scan(generator(seed), 400), np.arange(400)[:, None] % [[64, 7]]
+    np.c_[scan, rings][:, :columns].astype(dtype).tofile(tmp_path / "0.bin")
+    with pytest.raises(ValueError, match=f"0.bin .*looks like {kind}.*np.save") as refusal:
+        kitti.read_scan(tmp_path / "0.bin")
+    remedy = re.search(r"np.save\(.*\)", str(refusal.value))[0]
+    exec(remedy, {"np": np, "OLD": tmp_path / "0.bin", "NEW": tmp_path / "0.npy"})
+    assert_array_equal(kitti.read_scan(tmp_path / "0.npy"), scan)
+
+
+def test_intensities_of_0_to_255_are_scaled_and_said_and_outliers_are_clipped(cwd, capsys):
+    good = random_scan(generator(0), 400)
+    good[:3, 3] = 1, 0, 1
+    outliers = good.copy()
+    outliers[:3, 3] = 30, -0.001, 1.5  # less than 1 % of the points
+    for i in range(15):
+        outliers.tofile(f"{SCANS}/{i:06d}.bin")
+    s, = kitti.open_sequences("root", "00")
+    assert s.notes == []
+    assert_array_equal(s.scan(0), good)
+
+    for i in range(15):
+        (good * np.float32([1, 1, 1, 255])).tofile(f"{SCANS}/{i:06d}.bin")
+    s, = kitti.open_sequences("root", "00")
+    assert_allclose(s.scan(0), good, rtol=1e-6)
+    for command in ("eval --data root --sequences 00 --weights w.pt",
+                    "train --data root --sequences 00 --weights w.pt --epochs 1"):
+        assert run(command) == 0
+        assert "sequence 00: intensities reach 255; all are divided" in capsys.readouterr().err
+
+
+def test_points_without_a_return_are_dropped_and_copies_do_not_count(tmp_path):
+    scan = random_scan(generator(0), 60)
+    records = scan_records(np.insert(scan, [5] * 9, 0, axis=0), SMALL)
+    assert records["invalid"] == 0 and records.tobytes() == scan_records(scan, SMALL).tobytes()
+    with pytest.raises(ValueError, match="15 different usable points"):
+        scan_records(np.repeat(scan[:15], 9, axis=0), SMALL)
+
+
+def test_numbers_as_names_are_sorted_by_value_and_gaps_in_time_are_noted(tmp_path):
+    names = ["8.9", "8.95", "9.0", "9.05", "9.1", "10.15"]
+    for i, name in enumerate(names):
+        random_scan(generator(i), 50).tofile(tmp_path / f"{name}.bin")
+    assert [path.stem for path in kitti.scans_in(tmp_path)] == names
+    s, = kitti.open_sequences(tmp_path)
+    assert any("20 scans are missing by the file names, the first after 9.1.bin" in note
+               for note in s.notes)
+    times = tmp_path / "times.txt"
+    times.write_text("\ufeff0\n0.1\n0.2\n0.35\n0.46\n0.56\n", "utf-8")  # not quite regular
+    assert len(kitti.Sequence(tmp_path).notes) == 1
+    times.write_text("0\n0.1\n0.2\n0.5\n0.6\n0.7\n")
+    notes = kitti.Sequence(tmp_path).notes
+    assert any("2 scans are missing by the times.txt, the first after 9.0.bin" in note
+               for note in notes)
+    times.write_text("\n".join(f"{i}00000000" for i in range(6)))
+    with pytest.raises(ValueError, match="cannot be seconds: divide nanoseconds"):
+        kitti.Sequence(tmp_path)
+
+
+def test_a_wild_step_of_the_truth_is_named(cwd, capsys):
+    T = metrics.read_poses(POSES)
+    T[2:] = T[2:] @ from_vector([0, 0, 0, 0, 60, 0])
+    metrics.write_poses(POSES, T)
+    for command in (EVAL, TRAIN):
+        assert run(command) == 0
+        assert re.search(r"00.txt, from line 2 to 3: a step of \d+.\d m and (5[89]|6[01]) deg",
+                         capsys.readouterr().err)
+
+
+def test_trajectories_are_drawn_from_a_common_start_and_frames_are_compared(cwd, capsys):
+    pytest.importorskip("matplotlib")
+    lidar = d3dlo.accumulate([from_vector([1.0, 0, 0, 0, 0, 5])] * 9)
+    elsewhere = from_vector([3e5, 4e6, 30, 0, 0, 90]) @ lidar
+    for name, T in dict(lidar=lidar, elsewhere=elsewhere, camera=straight_path(10, 1)).items():
+        metrics.write_poses(f"{name}.txt", T)
+    out = succeeds("metrics lidar.txt elsewhere.txt --plot 'a $_1.svg'", capsys)
+    assert figures(out, "lidar")[5] < 0.01 and "a $_1.svg" in out  # ATE
+    assert run("metrics camera.txt lidar.txt") == 0
+    assert "different frames" in capsys.readouterr().err
+    os.rename("drive", "run_$1_$2 \udcff")  # a byte that is no UTF-8
+    assert run("eval --data 'run_$1_$2 \udcff' --weights w.pt --plot --out o") == 0
+    assert {"plot.png", "results.json"} < set(os.listdir("o"))
+
+
+def test_a_tilde_in_a_path_is_the_home_folder(cwd, monkeypatch):
+    monkeypatch.setenv("HOME", str(cwd / "home"))
+    shutil.copytree("drive", "home/drive")
+    assert run("eval --data=~/drive --weights w.pt --out=~/out") == 0
+    assert run("metrics ~/out/poses.txt ~/out/poses.txt") == 0
+    assert "scans" in read("home/out/results.json")
+
+
+def test_odometry_does_not_depend_on_torchs_defaults_and_survives_strict_warnings(tmp_path):
+    path, scans = save_weights(tmp_path / "w.pt", random_net(generator(0))), [
+        random_scan(generator(i), 60) for i in range(3)]
+    expected = [*map(d3dlo.Odometry(path).register, scans)]
+    torch.set_default_dtype(torch.float64)
+    try:
+        assert_array_equal([*map(d3dlo.Odometry(path).register, scans)], expected)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    odometry = d3dlo.Odometry(path)
+    odometry.register(scans[0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(UserWarning, match="invalid points"):
+            odometry.register(np.r_[scans[2], [[np.nan] * 4]])
+    assert_array_equal([*map(odometry.register, scans[1:])], expected[1:])
+    for scan in ({}, np.zeros(60, "f4, f4"), scans[0].astype(complex), None, [["x"] * 4]):
+        with pytest.raises(ValueError, match="array of numbers"):
+            odometry.register(scan)
+
+
+def test_progress_needs_no_stderr(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", None)
+    assert [*kitti.progress(range(3), 3, "work")] == [0, 1, 2]
+
+
+def print_process(_):
+    print(os.getpid(), flush=True)
+    signal.pause()
+
+
+def test_workers_end_when_their_parent_is_killed():
+    script = f"import {__name__} as t; [*t.kitti.in_processes(t.print_process, [0, 1], 2, 1)]"
+    parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True,
+                              env=os.environ | {"PYTHONPATH": str(HERE)})
+    for _ in range(2):  # wait until both are at work
+        assert int(parent.stdout.readline()) != parent.pid
+    parent.kill()
+    parent.communicate(timeout=60)  # returns when no process holds the other end of the pipe
 
 
 # ------------------------------------------------------------------------------------------------

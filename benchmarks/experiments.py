@@ -38,7 +38,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import d3dlo
 import kitti
 import metrics
-from d3dlo import D3DLO, SHORT, Config, FlowEmbedding, MeanAbsoluteError, MiniPointNet
+from d3dlo import D3DLO, SHORT, Config, FlowEmbedding, MiniPointNet
 
 # ------------------------------------------------------------------------------------------------
 # Losses: section 3.4, and section 3.2 on uncertainty
@@ -186,7 +186,7 @@ class Variant(NamedTuple):
     paper: str | dict = ""  # the paper's words, or {split: its E_t [%] and E_r [deg/m]}
     changes: dict = {}  # what differs from Config(**SHORT)
     network: type = D3DLO
-    objective: Callable[[], nn.Module] = MeanAbsoluteError
+    objective: Callable[[], nn.Module] = nn.L1Loss
 
     def splits(self):
         """{split: the paper's two cells} of the splits it is measured on."""
@@ -229,7 +229,7 @@ EXPERIMENTS = {
     "output": {
         "Euler angles": Variant("best"),
         "quaternion":
-            Variant("no gain", {}, Quaternion, lambda: QuaternionLoss(MeanAbsoluteError())),
+            Variant("no gain", {}, Quaternion, lambda: QuaternionLoss(nn.L1Loss())),
         "quaternion, uncertainty weighting":
             Variant("", {}, Quaternion, lambda: QuaternionLoss(UncertaintyLoss()))},
     "scales": {
