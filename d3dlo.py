@@ -565,6 +565,7 @@ def fit(net, data, run, test=(), seed=0, device="cpu", objective=None, checkpoin
             step, losses = checkpoint["step"], checkpoint["losses"]
             for part, state in zip(parts, checkpoint["parts"], strict=True):
                 part.load_state_dict(state)
+            require("step", [step], 0, steps)
 
     def update_statistics(net):  # with batches of their own: no epoch has the number 2**31
         update_bn(batches(data, config, (seed, 2**31), 0, min(25, steps), device), net)
@@ -1186,7 +1187,7 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
             if s.name in SPLITS["test"] and s.poses is not None and len(s) > 1]
     fingerprints = [s.fingerprint(records["crc"]) for s, records in zip(chosen, loaded)]
     facts = training_facts(fingerprints, motions, loaded[:len(chosen)], earlier)
-    if checkpoint and checkpoint["trained_on"] != facts["trained_on"]:
+    if checkpoint and checkpoint.get("trained_on") != facts["trained_on"]:
         raise ValueError(f"{run}: the data has changed since this training run started; resume it "
                          "with the data it was started with")
 
@@ -1313,6 +1314,9 @@ def main(argv=None):
         else:
             train(config_from(args), **args)
 
+    if "device" not in args and torch.cuda.is_available():
+        print("d3dlo: there is a GPU; --device cuda uses it (nobody has tested it)",
+              file=sys.stderr)
     advice = "run it again" + ", with a new --out" * ("out" in args)
     if command == "train":
         advice = "continue with `python d3dlo.py train --out RUN --resume`"
