@@ -1127,21 +1127,23 @@ def training_facts(fingerprints, motions, records, earlier):
 
 
 def read_run(run):
-    """Read RUN/config.json. Returns Config, data, sequences, seed and weights of the run."""
+    """Read RUN/config.json: Config, data, sequences, seed, device and weights of the run."""
     try:
         content = json.loads((run / "config.json").read_text(encoding="utf-8"))
         config, arguments = Config(**content["config"]), content["arguments"]
         require("seed", [arguments["seed"]], 0, 2**63 - 1)
-        texts = [*arguments["sequences"], arguments["data"] or "", arguments["weights"] or ""]
+        texts = [*arguments["sequences"], arguments["device"], arguments["data"] or "",
+                 arguments["weights"] or ""]
         if not all(isinstance(text, str) for text in texts):
             raise ValueError("damaged")
-        return config, *(arguments[name] for name in ("data", "sequences", "seed", "weights"))
+        names = "data", "sequences", "seed", "device", "weights"
+        return config, *(arguments[name] for name in names)
     except (ValueError, KeyError, TypeError, AttributeError, OSError):
         raise ValueError(f"{run}/config.json: missing or damaged, so there is no training run to "
                          "resume; give its folder with --out") from None
 
 
-def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu", resume=False,
+def train(config=None, data=None, sequences=None, out=None, seed=0, device=None, resume=False,
           weights=None, network=D3DLO, objective=None):
     """Run the command `train`: train a network, then evaluate it on the held-out sequences.
 
@@ -1149,6 +1151,7 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     data: a folder in KITTI's layout. None: the simulated city.
     sequences: a list of names or splits to train on. None: see `choose_sequences`.
     out: a new or empty folder for the training run. None: a new one, runs/TIME.
+    device: None: that of the run to resume, or the CPU.
     resume: continue the run in `out`. Its config, data, sequences, seed and weights are used again.
     weights: start from these weights and keep their network and input settings.
     network, objective: the class of the network, and the loss; see `load_weights` and `fit`.
@@ -1156,12 +1159,14 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device="cpu"
     Returns the folder `out`. Raises ValueError if an argument or the data are invalid or the loss
     is not finite, and OSError if a file cannot be read or written.
     """
-    check_device(device)
     if resume:
         run = Path(out or "")
-        config, data, sequences, seed, weights = read_run(run)
+        config, data, sequences, seed, run_device, weights = read_run(run)
+        device = device or run_device
     else:
         check_output(out, data or SIMULATED)
+    device = device or "cpu"
+    check_device(device)
     require("seed", [seed], 0, 2**63 - 1)
     config = config or (Config() if data else Config(**SHORT))
     data, weights = (path and os.path.abspath(path) for path in (data, weights))

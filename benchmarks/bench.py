@@ -12,8 +12,8 @@ median and the range of baseline / here over the rounds. A pair-step is one pair
 direction, in one training step.
 
 With --against, the code in DIR is the baseline: of this version, of a later one, or of commit
-b9e6db3. fpsample and kiss-icp are baselines if they are installed. Children inherit the
-environment, so OMP_WAIT_POLICY=PASSIVE, for example, can be tried. Linux only.
+b9e6db3. fpsample and kiss-icp are baselines if they are installed. The processes inherit the
+environment, so OMP_WAIT_POLICY=ACTIVE, for example, can be tried. Linux only.
 """
 import argparse
 import functools
@@ -29,8 +29,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
+ENVIRONMENT = dict(os.environ)  # before d3dlo adds to it
 HERE = Path(__file__).resolve().parents[1]
 sys.path.insert(0, os.environ.get("D3DLO_CHECKOUT", str(HERE)))  # of a child: another checkout
 import d3dlo
@@ -124,6 +124,7 @@ def inference(s, form):
     records, _ = prepare(s)
     p = np.arange(len(records) - 1)
     batch, net = d3dlo.make_batch(records, p, p + 1, CONFIG), d3dlo.D3DLO(CONFIG).eval()
+    import torch  # after d3dlo, which makes its idle threads sleep
     with torch.inference_mode():
         return seconds(lambda: net(batch)) / len(p)
 
@@ -179,7 +180,7 @@ def in_child(name, s, form, checkout):
     """Measure in a separate process, with the code of a checkout. Returns what it prints."""
     command = [sys.executable, __file__, "--child", name, form, s.folder.parents[1], s.name]
     done = subprocess.run(command, capture_output=True, text=True,
-                          env=os.environ | {"D3DLO_CHECKOUT": str(checkout)})
+                          env=ENVIRONMENT | {"D3DLO_CHECKOUT": str(checkout)})
     if done.returncode:
         sys.exit(f"bench: {name}, {form}, {checkout}:\n{done.stderr}")
     return done.stdout.strip()
@@ -244,8 +245,8 @@ def main():
             raise ValueError(f"sequence {s.name} has {len(s)} scans, but 5 are needed")
     except (ValueError, OSError) as error:
         sys.exit(f"bench: {error}")
-    print(f"{kitti.cores()} cores of {platform.machine()}{', kept busy' * args.busy}, Python "
-          f"{platform.python_version()}, torch {torch.__version__}, numpy {np.__version__}\n"
+    versions = ", ".join(f"{name} {value}" for name, value in kitti.versions(HERE).items())
+    print(f"{kitti.cores()} cores of {platform.machine()}{', kept busy' * args.busy}; {versions}\n"
           f"sequence {s.name}, {len(s)} scans; {args.rounds} rounds\n\n"
           "| work | here | baseline | ratio, median | ratio, range |\n|---|---|---|---|---|")
     if args.busy:

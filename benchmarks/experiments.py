@@ -27,6 +27,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import d3dlo  # before torch, whose idle threads then sleep
+
+# isort: split
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -34,8 +38,6 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 from torch import nn
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import d3dlo
 import kitti
 import metrics
 from d3dlo import D3DLO, SHORT, Config, FlowEmbedding, MiniPointNet
@@ -398,7 +400,7 @@ def main():
     args = command_line()
     kitti.keep_freed_memory()
     kitti.treat_sigterm_as_interrupt()
-    root = d3dlo.data_root(args.data, (), whole=True)
+    root = d3dlo.data_root(args.data, ["all"])
     sequences = [s for s in kitti.open_sequences(root) if s.poses is not None]
     chosen = kitti.open_sequences(root, "train")
     trained, pairs = [s.name for s in chosen], sum(len(s.motions()) for s in chosen)
