@@ -795,7 +795,7 @@ def _raw_stream(folder, suffix):
     Line i of timestamps.txt, counted from 0, is the time of file i, to the nanosecond. It is blank
     where the recording has lost a file, as in drive 2011_09_26_drive_0009.
     """
-    lines = (folder / "timestamps.txt").read_text().splitlines()
+    lines = (folder / "timestamps.txt").read_bytes().decode("utf-8", "replace").splitlines()
     paths = sorted(path for path in folder.glob(f"data/*{suffix}") if path.stem.isdecimal())
     numbers = np.array([int(path.stem) for path in paths], int)
     if not paths:
