@@ -655,7 +655,7 @@ def read_archive(path):
         raise ValueError("compressed")
     if archive.testzip():  # torch does not verify the archive's checksums
         raise ValueError("damaged")
-    return torch.load(path, map_location="cpu", weights_only=True)
+    return dict(torch.load(path, map_location="cpu", weights_only=True))
 
 
 def build(network, config):
@@ -995,7 +995,7 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     odometry = Odometry(weights, device, refine, network)
     if plot:
         metrics.new_figure(1, 1)  # without matplotlib, fail now and not after the work
-    check_output(out, data or SIMULATED)
+    check_output(out, "results", data or SIMULATED)
     sequences = sequences or ("all" if data else ("test", "validation"))
     root = data_root(data, sequences)
     chosen = kitti.open_sequences(root, sequences)
@@ -1049,14 +1049,15 @@ def check_device(device):
                          "PyTorch for it") from None
 
 
-def check_output(out, root):
+def check_output(out, kind, root):
     """Raise ValueError unless results can go to `out`, a new or empty folder outside the data.
 
-    root: the folder of the data. Links are resolved.
+    out: None for a new folder in the folder `kind`; root: the folder of the data. Links are
+    resolved.
     """
-    if out and Path(out).exists() and (not Path(out).is_dir() or any(Path(out).iterdir())):
+    if out and os.path.lexists(out) and (not Path(out).is_dir() or any(Path(out).iterdir())):
         raise ValueError(f"--out {out}: exists and is not an empty folder; choose a new one")
-    place = Path(out or "").resolve()
+    place = Path(out or kind).resolve()
     if any(place.is_relative_to((Path(root) / name).resolve()) for name in ("sequences", "poses")):
         raise ValueError(f"{place} is inside the data folder; choose another folder with --out")
 
@@ -1071,7 +1072,7 @@ def claim_output(out, kind, name, content):
     for i in itertools.count(2):
         folder.mkdir(parents=True, exist_ok=True)
         try:
-            with open(folder / name, "x", encoding="utf-8") as file:
+            with metrics.naming(folder / name), open(folder / name, "x") as file:
                 file.write(text + "\n")
             return folder
         except FileExistsError:
@@ -1164,7 +1165,7 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device=None,
         config, data, sequences, seed, run_device, weights = read_run(run)
         device = device or run_device
     else:
-        check_output(out, data or SIMULATED)
+        check_output(out, "runs", data or SIMULATED)
     device = device or "cpu"
     check_device(device)
     require("seed", [seed], 0, 2**63 - 1)
@@ -1204,8 +1205,9 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device=None,
 
     def say(line):
         """Print a line and append it to the log."""
-        with open(run / "log.txt", "a", encoding="utf-8", errors="backslashreplace") as file:
-            file.write(line + "\n")
+        log = run / "log.txt"
+        with metrics.naming(log), open(log, "a", encoding="utf-8", errors="backslashreplace") as f:
+            f.write(line + "\n")
         print(line, flush=True)
 
     try:

@@ -1664,7 +1664,8 @@ def _save_scan(task):
     """Simulate a scan and write it; task: path, sequence, settings, number of the scan."""
     path, name, settings, i = task
     scan = _simulate_scan(name, settings["seed"], settings["scans"], settings["azimuth"], i)
-    scan.tofile(path)
+    with replacing(path) as temporary:
+        temporary.write_bytes(scan.tobytes())
 
 
 def _calibration():

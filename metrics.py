@@ -189,6 +189,17 @@ def table(rows):
 
 
 @contextmanager
+def naming(path):
+    """Name the file in an OSError of the block that has no name, such as for a full disk."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            raise OSError(f"{path}: could not be written ({error.strerror or error})") from None
+        raise
+
+
+@contextmanager
 def replacing(path):
     """Yield a temporary path beside `path`, and move it to `path` if the block succeeds.
 
@@ -201,12 +212,9 @@ def replacing(path):
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     try:
-        yield temporary
-        os.replace(temporary, path)
-    except OSError as error:
-        if error.filename is None:  # such as for a full disk
-            raise OSError(f"{path}: could not be written ({error.strerror or error})") from None
-        raise
+        with naming(path):
+            yield temporary
+            os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 

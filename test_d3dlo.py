@@ -841,6 +841,17 @@ def test_metrics_prints_the_errors_of_files_and_folders(cwd, capsys):
     assert_allclose(figures(out, "all")[:2], [len(pooled), pooled.mean()], atol=6e-4)
 
 
+@given(SEED, st.sampled_from([-1, 1]))
+def test_the_view_from_above_is_the_same_for_camera_and_lidar_poses(seed, gear):
+    lidar = random_trajectory(generator(seed), 50, [gear, 0.05, 0.05, 1, 1, 6])  # or in reverse
+    axes = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])  # the camera's
+    for T, labels in ((lidar, ("LiDAR -y, right [m]", "LiDAR x, forward [m]")),
+                      (axes @ lidar @ axes.T, ("camera x, right [m]", "camera z, forward [m]"))):
+        view, *got = metrics.view_from_above(T)
+        assert_allclose(view @ T[:, :3, 3].T, [-lidar[:, 1, 3], lidar[:, 0, 3]], atol=1e-9)
+        assert tuple(got) == labels
+
+
 # ------------------------------------------------------------------------------------------------
 # The data
 
@@ -977,6 +988,61 @@ def test_a_raw_drive_is_converted_with_poses_at_the_times_of_its_scans_and_split
             assert path.samefile(scan) == linked and not path.is_symlink()
             assert path.read_bytes() == scan.read_bytes()
     refused(f"raw {DRIVE} new", "drive_0013.* already exists.*choose", capsys)
+
+
+@pytest.mark.parametrize("name", ["01", "05", "06"])
+def test_simulated_vehicles_drive_beside_us_and_never_into_us(name):
+    world, near = kitti._world(name, 0, 170), 0
+    for i, T in enumerate(world.T_flat):
+        x, y, yaw, half_x, half_y = world.moving(i)[:, :5].T  # bodies and cabins
+        x, y = T[0, 3] - x, T[1, 3] - y  # from them to us
+        ahead = np.abs(x * np.cos(yaw) + y * np.sin(yaw)) - half_x
+        aside = np.abs(y * np.cos(yaw) - x * np.sin(yaw)) - half_y
+        gap = np.hypot(np.maximum(ahead, 0), np.maximum(aside, 0))
+        assert gap.min() > 0.9  # half the width of our own car
+        near += (gap < 30).sum()
+    assert near > 4 * 170
+
+
+UNGUARDED = """
+import multiprocessing, kitti
+multiprocessing.set_start_method("spawn", force=True)
+print([*kitti.in_processes(abs, [1, 2], workers=1)])
+"""
+
+
+def test_a_script_without_a_main_guard_gets_an_error_that_explains_it(cwd):
+    Path("script.py").write_text(UNGUARDED)
+    ran = subprocess.run([sys.executable, "script.py"], timeout=60, capture_output=True, text=True,
+                         env=os.environ | {"PYTHONPATH": str(HERE)})
+    assert "needs the line if __name__ == '__main__':" in ran.stderr.splitlines()[-1]
+
+
+def test_pictures_are_drawn_if_matplotlib_is_installed(cwd, monkeypatch, capsys):
+    with monkeypatch.context() as patch:  # as if matplotlib were not installed
+        patch.setitem(sys.modules, "matplotlib.figure", None)
+        for command in (f"{PLOT} a.png", f"{EVAL} --plot"):
+            refused(command, "matplotlib.*pip install", capsys)
+        assert not Path("cache").exists()  # refused before the work
+    pytest.importorskip("matplotlib")
+    assert run(f"{EVAL} --plot") == run(f"{PLOT} a.pdf") == run(f"{PLOT} a.svg") == 0
+    for name, start in (("out/plot.png", b"\x89PNG"), ("a.pdf", b"%PDF"), ("a.svg", b"<?xml")):
+        assert Path(name).read_bytes().startswith(start)
+
+
+def test_a_fingerprint_depends_on_the_scans_and_poses_and_not_on_names(cwd):
+    os.rename("root/sequences/03", "new")
+    a, same, other = (kitti.Sequence(folder, Path(f"root/poses/{name}.txt")) for folder, name in (
+        ("root/sequences/00", "00"), ("new", "00"), ("new", "03")))
+    crcs = np.arange(15, dtype=np.uint32)
+    assert a.fingerprint(crcs) == same.fingerprint(crcs) and a.name != same.name
+    assert len({a.fingerprint(crcs), other.fingerprint(crcs), a.fingerprint(crcs[::-1])}) == 3
+
+
+def test_the_version_is_printed(capsys):
+    with pytest.raises(SystemExit, match="^0$"):
+        run("--version")
+    assert capsys.readouterr().out == f"d3dlo {d3dlo.__version__}\n"
 
 
 # ------------------------------------------------------------------------------------------------

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-import d3dlo
 import kitti
 import metrics
 
@@ -63,7 +62,8 @@ def evaluate(root, names, out):
     metrics.write_json(out / "results.json", {
         "method": method, "settings": settings, "data": str(root), "sequences": results,
         "pooled": pooled})
-    print(metrics.table([*results.items(), ("all", pooled)]), d3dlo.LEGEND,
+    print(metrics.table([*results.items(), ("all", pooled)]),
+          "E_t, E_r: rectified left camera frame. t step, r step: Velodyne frame.",
           f"trajectories  {out}/NN.txt", f"errors        {out}/results.json", sep="\n")
 
 
