@@ -364,7 +364,7 @@ def random_points(rng, kind, N):
     xyz = rng.normal(size=(N, 3)) * [20, 20, 2]
     special = {"grid": rng.integers(-4, 5, (N, 3)), "line": xyz * [1, 0, 0],
                "one x": xyz * [0, 1, 1], "duplicates": xyz[rng.integers(max(N // 3, 1), size=N)],
-               "far away": xyz + 1e6}  # rounded to multiples of 6 cm
+               "far away": xyz / 100 + [1e6, 0, 0]}  # x is rounded to multiples of 6 cm
     return special.get(kind, xyz).astype("float64" if kind == "float64" else "float32")
 
 
@@ -414,7 +414,9 @@ def test_neighbours_equal_brute_force(seed, kind, N, k, r):
 
     rng = generator(seed)
     xyz, query, idx = random_points(rng, kind, N), random_points(rng, kind, N), rng.permutation(N)
-    assert_same(xyz[idx], d3dlo.group_ball(xyz, idx, r, k), nearest(xyz, xyz[idx], k, r, idx))
+    ball, within = d3dlo.group_ball(xyz, idx, r, k), nearest(xyz, xyz[idx], k, r, np.full(N, -1))
+    assert_same(xyz[idx], ball, np.where(within < 0, idx[:, None], within))
+    assert (np.where(within < 0, ball, idx[:, None]) == idx[:, None]).all()  # the centroid fills up
     expected, clouds = nearest(xyz, query, k), torch.from_numpy(np.stack([query, xyz, query]))
     assert_same(query, d3dlo.group_knn(xyz, query, k), expected)
     elsewhere = type("Elsewhere", (torch.Tensor,), {"device": SimpleNamespace(type="not cpu")})
@@ -494,6 +496,22 @@ def test_vectors_are_extrinsic_xyz_and_survive_the_round_trip_and_gimbal_lock(se
 def count(module):
     """Number of parameters to learn."""
     return sum(p.numel() for p in module.parameters() if p.requires_grad)
+
+
+LAYER = Layer(1.0, 16, 4, (4, 8))
+
+
+@pytest.mark.parametrize("name, value", [
+    ("epochs", 0), ("epochs", 1.5), ("batch", True), ("lr", 0), ("lr", np.nan), ("lr", "1"),
+    ("frozen", 1.0), ("frozen", -0.1), ("max_range", 0), ("optimizer", "sgd"), ("swap", None),
+    ("schedule", ""), ("plane", "yes"), ("r", LAYER._replace(r=-1.0)),
+    ("n_fps", LAYER._replace(n_fps=10**6)), ("n_fps of sa2", LAYER._replace(n_fps=7)),
+    ("n_n", LAYER._replace(n_n=0)), ("width", LAYER._replace(widths=(4, 10**6))),
+    ("number of widths", LAYER._replace(widths=(4,))), ("last width of mlp", LAYER)])
+def test_an_invalid_setting_is_refused_by_its_name(name, value):
+    field = name if name in vars(SMALL) else "mlp" if "mlp" in name else "sa1"
+    with pytest.raises(ValueError, match=f"^(the )?{name} (is|must be) "):
+        replace(SMALL, **{field: value})
 
 
 def test_the_default_is_table_1_with_61290_parameters_and_section_4():
