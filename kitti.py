@@ -626,8 +626,8 @@ def treat_sigterm_as_interrupt():
 def keep_freed_memory():
     """Let glibc keep large freed blocks instead of returning them to the system.
 
-    Otherwise every allocation causes new page faults, which cost a third of a training step's time
-    on a CPU.
+    Otherwise every allocation causes new page faults, which double the time of a training step on a
+    CPU.
     """
     with suppress(OSError, AttributeError, TypeError):  # another C library
         libc = ctypes.CDLL(None)
