@@ -31,7 +31,6 @@ import threading
 import time
 import warnings
 import zlib
-from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from contextlib import ExitStack, closing, contextmanager, suppress
 from decimal import Decimal
@@ -783,10 +782,14 @@ def _write_raw_sequence(folder, scans, Tr, times):
             os.link(scan.resolve(), target)
         except OSError:  # another file system, or one without links
             shutil.copyfile(scan, target)
+    _write_calib_and_times(folder, Tr, (times - times[0]) / SECOND)
+
+
+def _write_calib_and_times(folder, Tr, times, cameras=()):
+    """Write calib.txt, with Tr (4,4) and the lines of cameras, and times.txt, times (n,) [s]."""
     row = " ".join(f"{x:.12e}" for x in Tr[:3].ravel())
-    (folder / "calib.txt").write_text(f"Tr: {row}\n")
-    seconds = (times - times[0]) / SECOND
-    (folder / "times.txt").write_text("".join(f"{t:.6f}\n" for t in seconds))
+    (folder / "calib.txt").write_text("".join([*cameras, f"Tr: {row}\n"]))
+    (folder / "times.txt").write_text("".join(f"{t:.6f}\n" for t in times))
 
 
 def _raw_stream(folder, suffix):
@@ -862,29 +865,20 @@ def _imu_poses(packets, delay):
 
 
 # ------------------------------------------------------------------------------------------------
-# The simulated city
+# The simulated city: the road and our drive
 #
-# The world consists of vertical prisms (boxes and upright cylinders) on a raster of the ground. It
-# is built on flat land; hills are added to the finished points. Units are metres and radians, the
-# frame is x east, y north, z up. A prism is a row of 10 numbers:
+# Units are metres and radians, the frame is x east, y north, z up. The world is built on flat land
+# out of upright prisms, boxes and cylinders; hills are added to the finished points. A prism is a
+# row of 10 numbers: its centre; the heading of its x axis; half of its size along its own axes (the
+# radius of a cylinder); the height of its bottom and top; its albedo; how deep light gets into it
+# (foliage; 0 for a solid); 1 for a cylinder, 0 for a box.
 
-X, Y = 0, 1  # centre
-YAW = 2  # heading of its x axis
-HALF_X, HALF_Y = 3, 4  # half of its size along its own axes; the radius of a cylinder
-Z0, Z1 = 5, 6  # height of its bottom and its top
-ALBEDO = 7
-FUZZ = 8  # depth to which foliage lets light in; 0 for a solid
-ROUND = 9  # 1 for a cylinder, 0 for a box
+X, Y, YAW, HALF_X, HALF_Y, Z0, Z1, ALBEDO, FUZZ, ROUND = range(10)
 
 CITY = 4  # version; increase it when the city changes, so that scans of two versions never mix
-# Elevation of the 64 beams of an HDL-64E, from the lowest to the highest
-ELEVATION = np.radians(np.r_[np.linspace(-24.33, -8.83, 32), np.linspace(-8.33, 2.0, 32)])
-SENSOR_HEIGHT, MIN_RANGE, CITY_RANGE = 1.73, 2.5, 80.0
 LANE = 3.5  # width of a lane
 SIDE_STREET = 70.0  # how far a side street goes on both sides of the road
-CELL = 0.5  # size of a cell of the ground
-RELIEF = 0.4  # depth of windows and doors, in prisms higher than 3 m
-DENSE = 0  # of the surroundings 0 dense, 1 suburban and 2 open
+SENSOR_HEIGHT, MIN_RANGE, CITY_RANGE = 1.73, 2.5, 80.0
 
 
 class _Style(NamedTuple):
@@ -894,10 +888,8 @@ class _Style(NamedTuple):
     halts: int  # number of halts per 150 scans, in a queue at a light
     lanes: int  # number of lanes in each direction
     reservation: float  # width of the central reservation; only motorways have one
-    # Odds of no junction, a street corner, a ramp and a roundabout every 35 to 80 m; the distance
-    # is larger above 15 m/s
-    junctions: tuple
-    odds: tuple  # of dense, suburban and open surroundings
+    junctions: tuple  # odds of no junction, a street corner, a ramp and a roundabout
+    surroundings: tuple  # odds of dense, suburban and open ones
 
 
 STYLES = {
@@ -914,102 +906,21 @@ STYLES = {
     "10": _Style(14, 1, 1, 0, (5, 2, 2, 2), (2, 4, 3)),
 }
 
-# The drive
-
-
-class _Drive(NamedTuple):
-    """A road and a drive along it."""
-
-    position: Callable  # s, left=0 -> x, y, heading at s metres along the road, `left` to its left
-    distance: Callable  # seconds -> metres along the road
-    length: float  # of the road
-    halts: np.ndarray  # where we stand [m]
-
-
-def _drive(rng, scans, style):
-    """Draw a `_Drive`."""
-    ds = 0.25  # step along the road
-    start = 100.0  # the drive starts here, so there is road behind it as well
-    length = 100 + 0.13 * style.cruise * scans + 150
-    pieces = []  # (length, curvature [1/m], speed [m/s])
-    while sum(piece[0] for piece in pieces) < length:
-        pieces += _pieces_of_road(rng, style)
-    metres, curvature, speed = np.array(pieces).T
-    repeats = np.round(metres / ds).astype(int)
-    curvature, speed = np.repeat(curvature, repeats), np.repeat(speed, repeats)
-
-    def smooth(values, metres):
-        return gaussian_filter(values, metres / ds, mode="nearest")
-
-    # The steering wheel turns gradually and is never quite still
-    wobble = rng.normal(0, 0.01, len(curvature))
-    k = smooth(curvature, 1.7) + smooth(wobble, 8)
-    s = np.arange(len(k)) * ds
-
-    lateral = rng.uniform(3.4, 4.6)  # largest acceleration in bends [m/s2]
-    # The first halt is at the start, the others are up to 0.7 of the way
-    n = int(style.halts * scans / 150)
-    halts = start + 0.07 * style.cruise * scans * np.sort(rng.random(n)) * (np.arange(n) > 0)
-    limit = np.minimum(speed, np.sqrt(lateral / np.maximum(np.abs(k), 1e-4)))
-    for halt in halts:
-        limit[abs(s - halt) < 0.5] = 0.5
-    v = _limit_acceleration(limit, ds)
-
-    t = np.r_[0, np.cumsum(ds / smooth(v, 1.0))[:-1]]
-    driven = s
-    for halt in halts:  # stand still: two times for the same place
-        i = np.searchsorted(driven, halt)
-        t = np.r_[t[:i + 1], t[i:] + rng.uniform(1, 4)]
-        driven = np.insert(driven, i, driven[i])
-    t -= t[np.searchsorted(driven, start)]
-    heading = np.cumsum(k) * ds
-    x = np.cumsum(np.cos(heading)) * ds
-    y = np.cumsum(np.sin(heading)) * ds
-
-    def position(at, left=0.0):
-        angle = np.interp(at, s, heading)
-        x_left = np.interp(at, s, x) - left * np.sin(angle)
-        y_left = np.interp(at, s, y) + left * np.cos(angle)
-        return x_left, y_left, angle
-
-    def distance(at):
-        return np.interp(at, t, driven)
-
-    return _Drive(position, distance, s[-1], halts)
-
-
-def _limit_acceleration(limit, ds):
-    """The highest speeds [m/s] below `limit` (n,), at points `ds` metres apart, that a car reaches.
-
-    It accelerates (forward pass) and brakes (backward pass) by 2.5 m/s2 at most.
-    """
-    v = limit.copy()
-    gain = 2 * 2.5 * ds  # largest change of v^2 in a step
-    for i in range(1, len(v)):
-        v[i] = min(v[i], np.sqrt(v[i - 1]**2 + gain))
-    for i in range(len(v) - 2, -1, -1):
-        v[i] = min(v[i], np.sqrt(v[i + 1]**2 + gain))
-    return v
-
 
 def _pieces_of_road(rng, style):
-    """Draw a straight piece, a bend, which may be straight too, and a junction.
-
-    Returns pieces (length, curvature, speed).
-    """
+    """Draw a straight piece, a bend and a junction: a list of (length, curvature, speed)."""
     stretch = rng.uniform(35, 80) * max(style.cruise / 15, 1) ** 2
-    speed = style.cruise * rng.uniform(0.8, 1.0)
-    side = rng.choice([-1, 1])
-    lateral = rng.choice([0.0, rng.uniform(1.0, 2.8)])  # acceleration in the bend [m/s2]
-    bend = side * lateral / speed**2  # [1/m]
+    speed, side = style.cruise * rng.uniform(0.8, 1.0), rng.choice([-1, 1])
+    lateral = rng.choice([0.0, rng.uniform(1.0, 2.8)])  # acceleration in the bend, if it is one
+    bend = side * lateral / speed**2  # curvature [1/m]
     # A bend turns by 60 degrees at most
     arc = min(rng.uniform(0.5, 0.8) * stretch, np.radians(60) / max(abs(bend), 1e-6))
 
-    # Turns of the junction: radius [m], and angle [degrees], positive to the left
+    # Turns at the junction: radius, and angle [degrees], positive to the left. A roundabout is
+    # entered to the right, driven for a quarter or a half of it, and left to the right.
     kind = rng.choice(4, p=np.array(style.junctions) / sum(style.junctions))
     corner = rng.uniform(7, 12) + LANE * (style.lanes - 1), side * rng.uniform(70, 100)
     ramp = rng.uniform(25, 32), side * rng.uniform(60, 150)
-    # Enter a roundabout to the right, drive a quarter or a half of it, leave it to the right
     radius = rng.uniform(19, 25)
     roundabout = [(radius, -45), (radius, rng.choice([90, 180])), (radius, -45)]
     turns = ([], [corner], [ramp], roundabout)[kind]
@@ -1018,88 +929,128 @@ def _pieces_of_road(rng, style):
         for radius, angle in turns]
 
 
-def _sensor_poses(rng, drive, scans):
-    """Poses T_wt (scans,4,4) of the Velodyne on the flat world.
+class _Drive:
+    """A road and our drive along it, drawn at random. Places are given in metres along the road."""
 
-    The car follows the road. It leans in bends, pitches when it brakes, and shakes.
+    def __init__(self, rng, scans, style):
+        step, start = 0.25, 100.0  # we start here, so there is road behind us as well
+        pieces = []
+        while sum(piece[0] for piece in pieces) < start + 0.13 * style.cruise * scans + 150:
+            pieces += _pieces_of_road(rng, style)
+        metres, curvature, limit = np.array(pieces).T
+        repeats = np.round(metres / step).astype(int)
+        curvature, limit = np.repeat(curvature, repeats), np.repeat(limit, repeats)
+
+        def smooth(values, metres):
+            return gaussian_filter(values, metres / step, mode="nearest")
+
+        # The steering wheel turns gradually and is never quite still
+        k = smooth(curvature, 1.7) + smooth(rng.normal(0, 0.01, len(curvature)), 8)
+        s = self.s = np.arange(len(k)) * step
+        self.length = s[-1]
+        self.heading = np.cumsum(k) * step
+        self.x, self.y = np.cumsum([np.cos(self.heading), np.sin(self.heading)], axis=1) * step
+
+        # Speed: slower in bends, and nearly 0 at a halt; the first halt is at the start
+        lateral = rng.uniform(3.4, 4.6)  # largest acceleration in bends [m/s2]
+        halts = np.sort(rng.random(int(style.halts * scans / 150)))
+        halts[:1] = 0
+        self.halts = start + 0.07 * style.cruise * scans * halts
+        v = np.minimum(limit, np.sqrt(lateral / np.maximum(np.abs(k), 1e-4)))
+        for halt in self.halts:
+            v[abs(s - halt) < 0.5] = 0.5
+        for _ in range(2):  # accelerate, then, from the end to the start, brake by 2.5 m/s2 at most
+            for i in range(1, len(v)):
+                v[i] = min(v[i], np.sqrt(v[i - 1]**2 + 2 * 2.5 * step))
+            v = v[::-1]
+
+        # The time at every place; two times where we stand still
+        t = np.r_[0, np.cumsum(step / smooth(v, 1.0))[:-1]]
+        for halt in self.halts:
+            i = np.searchsorted(s, halt)
+            t, s = np.r_[t[:i + 1], t[i:] + rng.uniform(1, 4)], np.insert(s, i, s[i])
+        self.t, self.driven = t - t[np.searchsorted(s, start)], s
+
+    def position(self, at, left=0.0):
+        """x, y and heading at the places `at`, `left` metres to the left of our path."""
+        heading = np.interp(at, self.s, self.heading)
+        x = np.interp(at, self.s, self.x) - left * np.sin(heading)
+        return x, np.interp(at, self.s, self.y) + left * np.cos(heading), heading
+
+    def distance(self, t):
+        """The places where we are at the times t [s]."""
+        return np.interp(t, self.t, self.driven)
+
+    def is_measurable(self, scans):
+        """Whether we come far enough for segments of 100 m, and turn enough to measure rotation."""
+        s = self.distance(np.arange(scans + 1) * 0.1)
+        turn = np.degrees(np.diff(self.position(s)[2]))  # from each scan to the next
+        return (s[-1] - s[0] > 0.7 * min(scans, 170) and turn.std() > 0.85
+                and min(turn.max(), -turn.min()) > 0.5)
+
+
+def _sensor_poses(rng, drive, t):
+    """Poses T_wt (n,4,4) of the Velodyne at times t (n,), on flat land.
+
+    The car leans in bends, pitches when it brakes, and shakes.
     """
-    t = np.arange(scans) * 0.1  # [s]
+    def wave(size, low, high):  # the sum of five waves of random frequencies [Hz]
+        frequency, phase = rng.uniform((low, 0), (high, 6.3), (5, 2)).T[..., None]
+        return (size / 2 * np.sin(2 * np.pi * frequency * t + phase)).sum(axis=0)
 
-    def wave(size, low, high):
-        """The sum of 5 waves of random frequencies from `low` to `high` Hz."""
-        total = 0
-        for _ in range(5):
-            frequency, phase = rng.uniform(low, high), rng.uniform(0, 6.3)
-            total = total + size / 2 * np.sin(2 * np.pi * frequency * t + phase)
-        return total
-
-    # Speed and acceleration from the distances 0.2 s before, now and 0.2 s after
     before, s, after = (drive.distance(t + dt) for dt in (-0.2, 0, 0.2))
     speed = (after - before) / 0.4  # [m/s]
     acceleration = (after - 2 * s + before) / 0.04  # [m/s2]
-    x, y, yaw = drive.position(s)
     turn = drive.position(after)[2] - drive.position(before)[2]
     lateral = speed * turn / 0.4  # acceleration [m/s2]
-
     shake = np.minimum(speed / 8, 1)  # a car at rest does not shake
-    shake_roll = shake * (wave(0.25, 0.2, 0.8) + wave(0.12, 1, 2.5))
-    shake_pitch = shake * (wave(0.25, 0.2, 0.8) + wave(0.14, 1, 2.5))
-    shake_z = shake * wave(0.015, 0.3, 1.5)
-    roll = np.radians(0.25 * lateral + shake_roll)
-    pitch = np.radians(-0.2 * gaussian_filter(acceleration, 2) + shake_pitch)
-
-    T = np.tile(np.eye(4), (scans, 1, 1))
-    angles = np.stack([roll, pitch, yaw], axis=1)
-    T[:, :3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
-    # The rear axle follows the road. The Velodyne is ahead of it, so turns also move it sideways.
-    ahead = 0.8
-    T[:, 0, 3] = x + ahead * np.cos(yaw)
-    T[:, 1, 3] = y + ahead * np.sin(yaw)
-    T[:, 2, 3] = SENSOR_HEIGHT + shake_z
-    return T
+    roll = 0.25 * lateral + shake * (wave(0.25, 0.2, 0.8) + wave(0.12, 1, 2.5))
+    pitch = shake * (wave(0.25, 0.2, 0.8) + wave(0.14, 1, 2.5))
+    pitch -= 0.2 * gaussian_filter(acceleration, 2)
+    z = SENSOR_HEIGHT + shake * wave(0.015, 0.3, 1.5)
+    # The rear axle follows the road. The Velodyne is 0.8 m ahead of it, so turns move it sideways.
+    x, y, yaw = drive.position(s)
+    R = Rotation.from_euler("xyz", np.stack([np.radians(roll), np.radians(pitch), yaw], axis=1))
+    return rigid(R.as_matrix(), np.stack([x + 0.8 * np.cos(yaw), y + 0.8 * np.sin(yaw), z], axis=1))
 
 
 def _hills(rng, T):
-    """Draw the hills: height(x, y), and the poses T_wt (n,4,4) of the flat world moved onto them.
+    """Draw hills. Returns height(x, y), and the poses T_wt (n,4,4) of the flat land on the hills.
 
     The height is a sum of waves 80 to 400 m long, with a slope of some 3 % (root mean square). A
     pose is lifted to the height of the land and tilted with its slope.
     """
     k = 2 * np.pi / np.geomspace(80, 400, 6)  # wave numbers [rad/m]
     direction, phase = rng.uniform(0, 2 * np.pi, (2, 6))
-    kx, ky = k * np.cos(direction), k * np.sin(direction)
-    waves = np.stack([kx, ky, phase, 0.017 / k], axis=1).tolist()
+    waves = np.stack([k * np.cos(direction), k * np.sin(direction), phase, 0.017 / k], 1).tolist()
 
     def height(x, y):
         return sum(size * np.sin(kx * x + ky * y + phase) for kx, ky, phase, size in waves)
 
-    x, y, d = T[:, 0, 3], T[:, 1, 3], 0.5
-    slope_x = (height(x + d, y) - height(x - d, y)) / (2 * d)
-    slope_y = (height(x, y + d) - height(x, y - d)) / (2 * d)
-    tilt = np.stack([slope_y, -slope_x, 0 * x], axis=1)  # (n,3) rotation vectors
-    T_hills = T.copy()
-    T_hills[:, :3, :3] = Rotation.from_rotvec(tilt).as_matrix() @ T[:, :3, :3]
-    T_hills[:, 2, 3] += height(x, y)
-    return height, T_hills
+    x, y, z = T[:, :3, 3].T
+    slope_x = height(x + 0.5, y) - height(x - 0.5, y)
+    slope_y = height(x, y + 0.5) - height(x, y - 0.5)
+    tilt = Rotation.from_rotvec(np.stack([slope_y, -slope_x, 0 * x], axis=1)).as_matrix()
+    return height, rigid(tilt @ T[:, :3, :3], np.stack([x, y, z + height(x, y)], axis=1))
 
 
-# Houses, cars and plants along the road
+# What stands along the road
 
 
 def _prisms(*columns):
     """The 10 columns of prisms, numbers or arrays (n,) -> (n,10)."""
-    arrays = [np.asarray(column, dtype=float) for column in columns]
-    return np.stack(np.broadcast_arrays(*arrays), axis=-1).reshape(-1, 10)
+    arrays = np.broadcast_arrays(*(np.asarray(column, float) for column in columns))
+    return np.stack(arrays, axis=-1).reshape(-1, 10)
 
 
-# Car, van, lorry and bus: length from, to; height from, to; half of the width; waist, which is the
-# height of the lower part; length of the upper part and its shift to the rear, both in lengths of
-# the vehicle; albedo of the upper part relative to the lower, low where there are windows
+# Vehicles, from and to: length, height; then half of the width; the waist, which is the height of
+# the lower part; length of the upper part and its shift to the rear, in lengths of the vehicle;
+# albedo of the upper part relative to the lower, low where there are windows
 VEHICLES = np.array([
-    (3.6, 4.8, 1.4, 1.6, 0.88, 0.9, 0.58, 0.08, 0.6),
-    (5.0, 6.5, 2.0, 2.8, 0.95, 1.1, 0.80, 0.10, 0.8),
-    (7.0, 15.0, 3.2, 4.0, 1.25, 2.6, 0.75, 0.12, 1.2),
-    (10.0, 13.0, 2.9, 3.3, 1.25, 1.2, 1.00, 0.00, 0.7),
+    (3.6, 4.8, 1.4, 1.6, 0.88, 0.9, 0.58, 0.08, 0.6),  # car
+    (5.0, 6.5, 2.0, 2.8, 0.95, 1.1, 0.80, 0.10, 0.8),  # van
+    (7.0, 15.0, 3.2, 4.0, 1.25, 2.6, 0.75, 0.12, 1.2),  # lorry
+    (10.0, 13.0, 2.9, 3.3, 1.25, 1.2, 1.00, 0.00, 0.7),  # bus
 ])
 PARKED, MOVING = (0.88, 0.12, 0, 0), (0.76, 0.12, 0.08, 0.04)  # shares of these four
 
@@ -1126,94 +1077,70 @@ def _place(vehicles, x, y, yaw):
 
 
 class _Street:
-    """One side of a road: its prisms are collected in the list `prisms`.
+    """One side of the road. What stands there is collected in the list `prisms`.
 
     side: 1 for the left side, -1 for the right; edge: distance from our path to the edge of the
-    road; zones: the surroundings of every 70 m. Random numbers are drawn in a fixed order, since
-    the same seed must always give the same city.
+    road; zones: the surroundings of every 70 m, 0 for dense, 1 for suburban and 2 for open ones.
     """
 
     def __init__(self, rng, drive, side, edge, zones):
-        self.rng, self.position, self.length = rng, drive.position, drive.length
+        self.rng, self.drive, self.length, self.prisms = rng, drive, drive.length, []
         self.side, self.edge, self.zones = side, edge, zones
-        self.prisms = []
 
-    def put(self, s, out, half_x, half_y, z0, z1, albedo, fuzz=0.0, twist=0.0):
-        """A box at s metres along the road, `out` metres beyond its edge.
-
-        With half_y None, a cylinder of the radius half_x.
-        """
-        x, y, yaw = self.position(s, self.side * (self.edge + out))
+    def put(self, s, out, half_x, half_y, z1, albedo, fuzz=0, twist=0, z0=0):
+        """A box `out` metres beyond the edge of the road, or a cylinder if half_y is None."""
+        x, y, yaw = self.drive.position(s, self.side * (self.edge + out))
         self.prisms.append(_prisms(x, y, yaw + twist, half_x, half_y or half_x, z0, z1, albedo,
                                    fuzz, half_y is None))
 
     def tree(self, s, out):
         """A trunk and a crown."""
         u = self.rng.uniform
-        trunk, crown = u(0.1, 0.3), u(1.2, 3.2)  # radius of the trunk; where the crown begins
-        self.put(s, out, trunk, None, z0=0, z1=crown + 1, albedo=u(0.15, 0.35))
-        self.put(s, out, u(1.2, 3.5), None, z0=crown, z1=crown + u(3, 7), albedo=u(0.2, 0.45),
-                 fuzz=u(0.5, 2.5))
+        radius, crown = u(0.1, 0.3), u(1.2, 3.2)  # of the trunk; where the crown begins
+        self.put(s, out, radius, None, crown + 1, u(0.15, 0.35))
+        self.put(s, out, u(1.2, 3.5), None, crown + u(3, 7), u(0.2, 0.45), u(0.5, 2.5), z0=crown)
 
     def plots(self):
         """Houses and gardens, one plot after the other."""
         rng, u, s = self.rng, self.rng.uniform, 0.0
         while s < self.length:
             kind = self.zones[int(s / 70)]
-            plot = u(9, 22) if kind == DENSE else u(9, 16)  # its length along the road
-            setback = u(*((3.5, 7), (6, 14), (8, 30))[kind])
+            plot, setback = u(9, (22, 16, 16)[kind]), u(*((3.5, 7), (6, 14), (8, 30))[kind])
             middle = s + plot / 2
             if rng.random() < (0.95, 0.8, 0.3)[kind]:
                 self.house(middle, setback, plot)
-            if kind != DENSE and rng.random() < 0.65:  # a hedge, or a wall or fence
+            if kind > 0 and rng.random() < 0.65:  # a hedge, or a wall or fence
                 thick, fuzz = (0.35, 0.25) if rng.random() < 0.6 else (0.1, 0)
-                self.put(middle, u(2.2, 3.2), plot * u(0.3, 0.48), thick, z0=0, z1=u(0.6, 1.9),
-                         albedo=u(0.2, 0.4), fuzz=fuzz)
+                self.put(middle, u(2.2, 3.2), plot * u(0.3, 0.48), thick, u(0.6, 1.9), u(0.2, 0.4),
+                         fuzz)
             for _ in range(rng.poisson((1, 3, 3)[kind])):  # a tree and a bush
                 self.tree(s + u(0, 1) * plot, u(3, setback + 3))
-                self.put(s + u(0, 1) * plot, u(3, 7), u(0.4, 1.2), None, z0=0, z1=u(0.5, 1.8),
-                         albedo=u(0.2, 0.4), fuzz=0.25)
+                self.put(s + u(0, 1) * plot, u(3, 7), u(0.4, 1.2), None, u(0.5, 1.8), u(0.2, 0.4),
+                         0.25)
             # A gap to the next plot, wide or narrow
-            s += plot + (u(5, 14) if kind != DENSE or rng.random() < 0.35 else u(0, 1))
+            s += plot + (u(5, 14) if kind > 0 or rng.random() < 0.35 else u(0, 1))
 
     def house(self, s, setback, plot):
         """A house with bays, stairs and porches, without which all of a facade looks the same."""
         u, depth, albedo = self.rng.uniform, self.rng.uniform(7, 13), self.rng.uniform(0.2, 0.42)
-        self.put(s, setback + depth / 2, plot / 2, depth / 2, z0=0, z1=u(5, 14), albedo=albedo,
+        self.put(s, setback + depth / 2, plot / 2, depth / 2, u(5, 14), albedo,
                  twist=self.rng.normal() * 0.02)
         for _ in range(self.rng.integers(2, 6)):
             thick = u(0.1, 0.5)
-            self.put(s + u(-0.45, 0.45) * plot, setback - thick, u(0.3, 1.5), thick, z0=0,
-                     z1=u(1, 7), albedo=albedo * u(0.7, 1.3))
-
-    def parked_cars(self):
-        """Cars along the edge of the road."""
-        rng, s = self.rng, 0.0
-        while s < self.length:
-            car = _vehicles(rng, 1, PARKED)
-            if rng.random() < (0.7, 0.5, 0.1)[self.zones[int(s / 70)]]:
-                x, y, yaw = self.position(s, self.side * (self.edge + rng.uniform(1.2, 1.5)))
-                self.prisms.append(_place(car, x, y, yaw + rng.normal() * 0.03))
-            s += 2 * car[0, 0, HALF_X] + rng.uniform(0.6, 3)
-
-    def guard_rail(self, out):
-        """A guard rail `out` metres beyond the edge of the road."""
-        for s in np.arange(0, self.length, 4.0):
-            self.put(s, out, 2.0, 0.1, z0=0.4, z1=0.8, albedo=0.4)
+            self.put(s + u(-0.45, 0.45) * plot, setback - thick, u(0.3, 1.5), thick, u(1, 7),
+                     albedo * u(0.7, 1.3))
 
     def pavement(self):
-        """Trees, poles of lamps and signs, and boxes on the pavement."""
+        """Trees, poles of lamps and signs, and boxes."""
         u, s = self.rng.uniform, 0.0
         while s < self.length:
             choice = u(0, 1)
             if choice < 0.35:
                 self.tree(s, u(2.2, 3))
             elif choice < 0.7:
-                self.put(s, u(0.5, 2.5), u(0.04, 0.12), None, z0=0, z1=u(2.5, 8),
-                         albedo=u(0.2, 0.6))
+                self.put(s, u(0.5, 2.5), u(0.04, 0.12), None, u(2.5, 8), u(0.2, 0.6))
             elif choice < 0.9:
-                self.put(s, u(2.2, 3), u(0.2, 0.6), u(0.2, 0.4), z0=0, z1=u(0.7, 1.7),
-                         albedo=u(0.1, 0.6))
+                self.put(s, u(2.2, 3), u(0.2, 0.6), u(0.2, 0.4), u(0.7, 1.7), u(0.1, 0.6))
             s += u(2, 11)
 
     def background(self):
@@ -1221,33 +1148,45 @@ class _Street:
         rng, u = self.rng, self.rng.uniform
         for _ in range(int(self.length / 4)):
             s, out, choice = u(0, self.length), u(6, 65), rng.random()
-            if choice < 0.3:  # a house
-                self.put(s, out, u(4, 12), u(4, 8), z0=0, z1=u(4, 12), albedo=u(0.2, 0.4),
-                         twist=rng.normal() * 0.3)
+            if choice < 0.3:
+                self.put(s, out, u(4, 12), u(4, 8), u(4, 12), u(0.2, 0.4), 0, rng.normal() * 0.3)
             elif choice < 0.6:
                 self.tree(s, out)
-            else:  # a thicket or the edge of a wood
-                self.put(s, out, u(1, 8), u(1, 4), z0=0, z1=u(1, 8), albedo=u(0.2, 0.45),
-                         fuzz=u(1, 4), twist=rng.normal() * 0.5)
+            else:
+                self.put(s, out, u(1, 8), u(1, 4), u(1, 8), u(0.2, 0.45), u(1, 4),
+                         rng.normal() * 0.5)
+
+    def parked_cars(self):
+        """Cars along the edge of the road."""
+        rng, s = self.rng, 0.0
+        while s < self.length:
+            car = _vehicles(rng, 1, PARKED)
+            if rng.random() < (0.7, 0.5, 0.1)[self.zones[int(s / 70)]]:
+                x, y, yaw = self.drive.position(s, self.side * (self.edge + rng.uniform(1.2, 1.5)))
+                self.prisms.append(_place(car, x, y, yaw + rng.normal() * 0.03))
+            s += 2 * car[0, 0, HALF_X] + rng.uniform(0.6, 3)
 
 
 def _roadside(rng, drive, lanes, style):
     """Draw everything that stands along the road -> prisms (n,10)."""
-    shares = np.array(style.odds) / sum(style.odds)
-    zones = rng.choice(3, p=shares, size=(2, int(drive.length / 70) + 1))
+    odds = np.array(style.surroundings)
+    zones = rng.choice(3, p=odds / sum(odds), size=(2, int(drive.length / 70) + 1))
     left = _Street(rng, drive, 1, lanes[1].max() + LANE / 2, zones[0])
     right = _Street(rng, drive, -1, LANE / 2 - lanes[0].min(), zones[1])
+    rails = (left, 1.5), (right, 1.5), (left, -len(lanes[1]) * LANE - style.reservation / 2)
     for street in left, right:
         street.plots()
         street.pavement()
         street.background()
-        if style.reservation:
-            street.guard_rail(1.5)
-        else:
+        if not style.reservation:
             street.parked_cars()
-    if style.reservation:  # in its middle
-        left.guard_rail(-len(lanes[1]) * LANE - style.reservation / 2)
+    for street, out in rails[:3 * bool(style.reservation)]:
+        for s in np.arange(0, drive.length, 4.0):
+            street.put(s, out, 2.0, 0.1, 0.8, 0.4, z0=0.4)
     return np.concatenate(left.prisms + right.prisms)
+
+
+CELL = 0.5  # size of a cell of the ground
 
 
 def _ground(rng, drive, lanes, side_streets):
@@ -1255,36 +1194,34 @@ def _ground(rng, drive, lanes, side_streets):
 
     Returns the height, 0 only on roads, and the albedo of every cell, and the raster's corner (2,).
     """
-    step = CELL / 2
+    f4, step = np.float32, CELL / 2
     along, across = np.arange(0, drive.length, step), np.arange(-SIDE_STREET, SIDE_STREET, step)
     areas = [(along, np.arange(way.min() - LANE / 2 + step, way.max() + LANE / 2, step))
              for way in lanes]
     areas += [(np.arange(s - LANE + step, s + LANE, step), across) for s in side_streets]
     points = [np.stack(drive.position(s[:, None], left)[:2]).reshape(2, -1) for s, left in areas]
     points = np.concatenate(points, axis=1)  # (2,m)
-    corner = points.min(axis=1) - CITY_RANGE - 5
+    corner = points.min(axis=1) - 85
     i, j = ((points - corner[:, None]) / CELL).astype(int)
-    margin = int(90 / CELL)
-    off_road = np.ones((i.max() + margin, j.max() + margin), bool)
+    off_road = np.ones((i.max() + int(90 / CELL), j.max() + int(90 / CELL)), bool)
     off_road[i, j] = False
-    away = distance_transform_edt(off_road).astype(np.float32) * CELL  # from the road
-    # Noise of standard deviation 1, about 4 m wide
-    noise = gaussian_filter(rng.standard_normal(off_road.shape, dtype=np.float32), 8) * 28
+    away = distance_transform_edt(off_road).astype(f4) * CELL  # from the road
     grass = np.clip((away - 2.5) / 6, 0, 1)  # from 0 on the pavement to 1
+    # Noise of standard deviation 1, about 4 m wide
+    noise = gaussian_filter(rng.standard_normal(off_road.shape, dtype=f4), 8) * 28
     height = np.where(off_road, 0.12, 0) + grass * np.clip(0.15 + 0.2 * noise, 0, 0.6)
     albedo = 0.33 + np.where(off_road, 0.03, 0) + 0.03 * noise - 0.04 * grass
-    return height.astype(np.float32), albedo.astype(np.float32), corner
+    return height.astype(f4), albedo.astype(f4), corner
 
 
-def _leave_road_free(prisms, ground):
+def _is_off_road(prisms, ground):
     """Which prisms (n,10) are off the road or, like crowns, higher than a car -> (n,) bool."""
     height, _, corner = ground
     x, y, yaw, half_x, half_y = prisms[:, [X, Y, YAW, HALF_X, HALF_Y]].T[:, :, None, None]
     along, across = half_x * np.linspace(-1, 1, 9)[:, None], half_y * np.linspace(-1, 1, 9)
-    x = x + along * np.cos(yaw) - across * np.sin(yaw)  # (n,9,9) points of each prism
-    y = y + along * np.sin(yaw) + across * np.cos(yaw)
-    i = np.clip((x - corner[0]) / CELL, 0, height.shape[0] - 1).astype(int)
-    j = np.clip((y - corner[1]) / CELL, 0, height.shape[1] - 1).astype(int)
+    i = (x + along * np.cos(yaw) - across * np.sin(yaw) - corner[0]) / CELL  # (n,9,9)
+    j = (y + along * np.sin(yaw) + across * np.cos(yaw) - corner[1]) / CELL
+    i, j = (np.clip(k, 0, n - 1).astype(int) for k, n in zip((i, j), height.shape))
     return (height[i, j] > 0).all(axis=(1, 2)) | (prisms[:, Z0] > 2.2)
 
 
@@ -1292,10 +1229,10 @@ def _leave_road_free(prisms, ground):
 
 
 def _lane_with_us(rng, drive, t, left):
-    """Draw the vehicles of a lane in our direction: prisms (2,n,10), metres driven (n,scans).
+    """Draw the vehicles of a lane in our direction: prisms (2,n,10), places (n,scans).
 
     Each does what the one ahead of it does, a little later and some metres behind (Newell's model
-    of car following). All follow our own drive: they slow down in bends and queue at lights with
+    of car following). All follow our own drive, so they slow down in bends and queue at lights with
     us. Vehicles to our left are faster than we are and those to our right slower, by 2 to 30 %.
     """
     own = drive.distance(t)
@@ -1306,7 +1243,7 @@ def _lane_with_us(rng, drive, t, left):
     vehicles = _vehicles(rng, n, MOVING)
     half = vehicles[0, :, HALF_X, None]  # of the length (n,1)
     offset = np.cumsum(2 * half + rng.uniform(2, 5, (n, 1)), axis=0) - half
-    lead = np.cumsum(rng.uniform(0.7, 2.0, n))[:, None]  # [s]
+    lead = np.cumsum(rng.uniform(0.7, 2.0, (n, 1)), axis=0)  # [s]
     # The vehicle in the middle is beside us or, in our lane, in our place
     offset, lead = offset - offset[n // 2], lead - lead[n // 2]
     wave, phase = rng.uniform(0.2, 0.6, (n, 1)), rng.uniform(0, 6.3, (n, 1))
@@ -1318,14 +1255,13 @@ def _lane_with_us(rng, drive, t, left):
 
 
 def _traffic(rng, drive, t, lanes, side_streets, style):
-    """Draw all vehicles on the road: moving(i) -> prisms (m,10) at scan i."""
-    # Groups of vehicles: prisms (2,n,10), metres along the road and to the left of our path, and
+    """Draw all vehicles on the road at times t (scans,): moving(i) -> prisms (m,10) at scan i."""
+    # Groups of vehicles: prisms (2,n,10), places along the road, metres to the left of our path,
     # angle to the road. The first is our own car; the sensor is 0.8 m ahead of its rear axle.
     own = drive.distance(t)
-    car = _prisms(0, 0, 0, 2.5, 1.0, 0, 2, 0, 0, 0)[None].repeat(2, 0)
+    car = _prisms(0, 0, 0, 2.5, 1.0, 0, 2, 0, 0, 0)[None].repeat(2, axis=0)
     groups = [(car, own + 0.8, 0, 0)]
-    for left in lanes[0]:
-        groups.append((*_lane_with_us(rng, drive, t, left), left, 0))
+    groups += [(*_lane_with_us(rng, drive, t, left), left, 0) for left in lanes[0]]
     for left in lanes[1]:  # towards us, at the speed of their lane
         speed = style.cruise * rng.uniform(0.6, 1.0)
         n = int((drive.length + speed * t[-1]) / 40)
@@ -1335,8 +1271,7 @@ def _traffic(rng, drive, t, lanes, side_streets, style):
         side, speed = rng.choice([-1, 1], (8, 1)), rng.uniform(4, 12, (8, 1))
         our_time = t[np.searchsorted(own, street - 20).clip(0, len(t) - 1)]
         left = side * speed * (t - our_time - rng.uniform(-8, 8, (8, 1)))
-        groups.append((_vehicles(rng, 8, MOVING), street + side * LANE / 2, left,
-                       side * np.pi / 2))
+        groups.append((_vehicles(rng, 8, MOVING), street + side * LANE / 2, left, side * np.pi / 2))
 
     vehicles = np.concatenate([group[0] for group in groups], axis=1)  # (2,n,10)
     s, left, turn = (np.concatenate([np.broadcast_to(group[k], (group[0].shape[1], len(t)))
@@ -1372,144 +1307,114 @@ def _remove_collisions(x, y, yaw, seen, vehicles):
             seen[j] = False
 
 
-class _World(NamedTuple):
-    """Everything about a sequence but the sensor."""
+class _World:
+    """All of a sequence but the sensor.
 
-    T: np.ndarray  # (scans,4,4) poses T_wt of the Velodyne
-    T_flat: np.ndarray  # (scans,4,4) the same before the hills were added
-    prisms: np.ndarray  # (n,10) everything that stands still
-    moving: Callable  # scan i -> prisms (m,10) of the vehicles on the road
-    ground: tuple  # height and albedo of every cell, corner of the raster
-    height: Callable  # x, y -> height of the hills
-
-
-@functools.lru_cache(maxsize=1)
-def _world(name, seed, scans):
-    """Draw the `_World` of a sequence.
-
-    The random numbers depend on its name, so it does not matter which others are made with it.
+    T, T_flat (scans,4,4): poses T_wt of the Velodyne, on the hills and before they were added;
+    prisms (n,10): what stands still; moving(i) -> prisms (m,10) of the vehicles at scan i; ground:
+    see `_ground`; height(x, y): the hills. The random numbers depend on the sequence's name, so it
+    does not matter which others are made with it.
     """
-    style = STYLES.get(name, STYLES["00"])
-    rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-    t = np.arange(scans + 1) * 0.1  # [s]
-    for _ in range(1000):  # draw again until the drive can be measured
-        drive = _drive(rng, scans, style)
-        s = drive.distance(t)  # (scans + 1,)
-        if scans < 100 or _is_measurable(drive, s):
-            break
-    drive = drive._replace(length=min(drive.length, s[-1] + 120))  # what is farther is not seen
-    T = _sensor_poses(rng, drive, scans)
-    # Offsets of the lanes to the left of our path, in our direction and in the other. Our own lane,
-    # drawn at random, is at 0.
-    ours = (np.arange(style.lanes) - rng.integers(style.lanes)) * LANE
-    lanes = ours, ours.max() + style.reservation + LANE * np.arange(1, style.lanes + 1)
-    # Side streets are at the light ahead of every halt and elsewhere, where the road is straight
-    at = np.r_[drive.halts + 30, rng.uniform(0, drive.length, int(drive.length / 120))]
-    turn = drive.position(at + 8)[2] - drive.position(at - 8)[2]
-    side_streets = at[(np.abs(turn) < 0.1) & (style.reservation == 0)]
-    ground = _ground(rng, drive, lanes, side_streets)
-    prisms = _roadside(rng, drive, lanes, style)
-    prisms = prisms[_leave_road_free(prisms, ground)]
-    moving = _traffic(rng, drive, t[:-1], lanes, side_streets, style)
-    height, T_hills = _hills(rng, T)
-    return _World(T_hills, T, prisms, moving, ground, height)
 
-
-def _is_measurable(drive, s):
-    """Whether a drive is long enough for segments of 100 m and turns enough for rotation to matter.
-
-    s (scans + 1,): distances along the road, 0.1 s apart.
-    """
-    far = s[-1] - s[0] > 0.7 * min(len(s) - 1, 170)
-    turn = np.degrees(np.diff(drive.position(s)[2]))  # yaw of every step
-    return far and turn.std() > 0.85 and min(turn.max(), -turn.min()) > 0.5
+    def __init__(self, name, seed, scans):
+        style, t = STYLES.get(name, STYLES["00"]), np.arange(scans) * 0.1  # [s]
+        rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
+        for _ in range(1000):  # draw again until the drive can be measured
+            drive = _Drive(rng, scans, style)
+            if scans < 100 or drive.is_measurable(scans):
+                break
+        drive.length = min(drive.length, drive.distance(scans * 0.1) + 120)  # the rest is not seen
+        self.T_flat = _sensor_poses(rng, drive, t)
+        # Lanes in our direction, and in the other: metres to the left of our path. Our own is at 0.
+        ours = (np.arange(style.lanes) - rng.integers(style.lanes)) * LANE
+        lanes = ours, ours.max() + style.reservation + LANE * np.arange(1, style.lanes + 1)
+        # Side streets: at the light ahead of every halt and elsewhere, where the road is straight
+        at = np.r_[drive.halts + 30, rng.uniform(0, drive.length, int(drive.length / 120))]
+        turn = drive.position(at + 8)[2] - drive.position(at - 8)[2]
+        side_streets = at[(np.abs(turn) < 0.1) & (style.reservation == 0)]
+        self.ground = _ground(rng, drive, lanes, side_streets)
+        prisms = _roadside(rng, drive, lanes, style)
+        self.prisms = prisms[_is_off_road(prisms, self.ground)]
+        self.moving = _traffic(rng, drive, t, lanes, side_streets, style)
+        self.height, self.T = _hills(rng, self.T_flat)
 
 
 # The sensor
+
+# Elevation of the 64 beams of an HDL-64E, from the lowest to the highest
+ELEVATION = np.radians(np.r_[np.linspace(-24.33, -8.83, 32), np.linspace(-8.33, 2.0, 32)])
+RELIEF = 0.4  # depth of windows and doors, in prisms higher than 3 m
 
 
 class _Rays:
     """The rays of a scan, numbered by beam, from the top, and by column.
 
-    All rays of a column have the same azimuth in the world, so in plan (seen from above) they are
-    one line. There are A columns. Roll and pitch are exact: they change a ray's elevation. A beam
-    of elevation e in the sensor's frame has the elevation w in the world, with
-    sin(e) = n . ray = gain * sin(w + tilt), where n is the sensor's up axis in the world.
+    All rays of a column have the same azimuth in the world, so seen from above they are one line.
+    There are A columns. Roll and pitch change a ray's elevation: e in the sensor's frame and w in
+    the world are related by sin(e) = n . ray = gain * sin(w + tilt), with the sensor's up axis n.
     """
 
     def __init__(self, R, azimuth, rng):
         self.step = 2 * np.pi / azimuth  # angle from a column to the next
-        heading = np.arctan2(R[1, 0], R[0, 0])
-        self.a0 = heading + self.step * rng.random()  # azimuth of the first column
+        self.a0 = np.arctan2(R[1, 0], R[0, 0]) + self.step * rng.random()  # of the first column
         a = self.a0 + self.step * np.arange(azimuth)  # (A,)
-        along = R[0, 2] * np.cos(a) + R[1, 2] * np.sin(a)  # (A,)
-        self.cos_a = np.cos(a).astype(np.float32)
-        self.sin_a = np.sin(a).astype(np.float32)
-        self.tilt = np.arctan2(along, R[2, 2]).astype(np.float32)
-        self.gain = np.hypot(along, R[2, 2]).astype(np.float32)
-        sin_e = np.sin(ELEVATION[::-1]).astype(np.float32)[:, None]  # (64,1)
+        along = R[0, 2] * np.cos(a) + R[1, 2] * np.sin(a)
+        self.cos_a, self.sin_a, self.tilt, self.gain = np.float32(
+            [np.cos(a), np.sin(a), np.arctan2(along, R[2, 2]), np.hypot(along, R[2, 2])])
+        sin_e = np.float32(np.sin(ELEVATION[::-1]))[:, None]  # (64,1)
         w = np.arcsin(sin_e / self.gain) - self.tilt  # (64,A)
-        self.top = np.tan(w[0])  # (A,) slope of the highest beam
         self.sin_w, self.cos_w = np.sin(w).ravel(), np.cos(w).ravel()  # (64 A,)
-        self.slope = self.sin_w / self.cos_w  # (64 A,)
+        self.slope = self.sin_w / self.cos_w
+
+    def beams_below(self, slope, col):
+        """The number of beams of a column that are below `slope`."""
+        sin_e = self.gain[col] * np.sin(np.arctan(slope) + self.tilt[col])
+        return np.searchsorted(ELEVATION, np.arcsin(np.clip(sin_e, -1, 1)))
 
 
 def _expand_ranges(first, count):
-    """Expand n ranges of integers, each of count[i] numbers from first[i] on.
-
-    first, count (n,) -> two arrays, as long as the sum of the counts: the i of each number, and the
-    numbers.
-    """
+    """Ranges of integers, count[i] numbers from first[i] on -> the i of each, and the numbers."""
     i = np.repeat(np.arange(len(count)), count)
-    end = np.cumsum(count)
-    return i, np.arange(len(i)) + np.repeat(first - end + count, count)
+    return i, np.arange(len(i)) + np.repeat(first - np.cumsum(count) + count, count)
 
 
-def _cross_prisms(p, eye, rays):
-    """Where columns of rays cross prisms (n,10) in plan.
+def _crossings(p, eye, rays):
+    """Where columns of rays cross prisms (n,10), seen from above.
 
-    Returns five arrays (P,), for the P pairs of a prism and a column that may meet: prism, column,
-    distance at which the column's line enters the prism, distance at which it leaves it, and cosine
-    of the angle of incidence. A box is the intersection of two slabs, a cylinder is a circle.
+    Returns five arrays, a number for each crossing: prism, column, distance at which the column
+    enters the prism and leaves it, cosine of the angle of incidence. A box is the intersection of
+    two slabs, a cylinder a disc.
     """
-    dx, dy = p[:, X] - eye[0], p[:, Y] - eye[1]
+    dx, dy, half_x, half_y = p[:, X] - eye[0], p[:, Y] - eye[1], p[:, HALF_X], p[:, HALF_Y]
     c, s = np.cos(p[:, YAW]), np.sin(p[:, YAW])
-    eye_x, eye_y = -(c * dx + s * dy), s * dx - c * dy  # the eye in the prism's frame
+    x, y = -(c * dx + s * dy), s * dx - c * dy  # the eye in the prism's frame
 
-    # The columns between the leftmost and the rightmost corner; all columns from inside a prism
-    corner_x = np.array([1, 1, -1, -1]) * p[:, HALF_X, None]  # (n,4) in the prism's frame
-    corner_y = np.array([1, -1, 1, -1]) * p[:, HALF_Y, None]  # (n,4)
-    to_x = dx[:, None] + c[:, None] * corner_x - s[:, None] * corner_y  # (n,4) in the world
-    to_y = dy[:, None] + s[:, None] * corner_x + c[:, None] * corner_y  # (n,4)
+    # Candidates are the columns between the leftmost and the rightmost corner
+    corner_x, corner_y = half_x * [[1], [1], [-1], [-1]], half_y * [[1], [-1], [1], [-1]]  # (4,n)
+    to_x, to_y = dx + c * corner_x - s * corner_y, dy + s * corner_x + c * corner_y
     centre = np.arctan2(dy, dx)
-    wide = np.arctan2(to_y, to_x) - centre[:, None]  # (n,4) azimuth of the corners
-    wide = (wide + np.pi) % (2 * np.pi) - np.pi  # within -pi to pi
-    first = np.ceil((centre + wide.min(axis=1) - rays.a0) / rays.step).astype(int)
-    last = np.floor((centre + wide.max(axis=1) - rays.a0) / rays.step).astype(int)
-    inside = (np.abs(eye_x) < p[:, HALF_X] + 0.3) & (np.abs(eye_y) < p[:, HALF_Y] + 0.3)
-    k, col = _expand_ranges(first, np.where(inside, 0, last - first + 1))  # (P,)
+    wide = (np.arctan2(to_y, to_x) - centre + np.pi) % (2 * np.pi) - np.pi
+    first = np.ceil((centre + wide.min(axis=0) - rays.a0) / rays.step).astype(int)
+    last = np.floor((centre + wide.max(axis=0) - rays.a0) / rays.step).astype(int)
+    inside = (np.abs(x) < half_x + 0.3) & (np.abs(y) < half_y + 0.3)
+    k, col = _expand_ranges(first, np.where(inside, 0, last - first + 1))
     col %= len(rays.cos_a)
 
-    # From here on one number for every pair, in float32
-    of_prism = np.stack([c, s, eye_x, eye_y, p[:, HALF_X], p[:, HALF_Y], dx, dy, p[:, ROUND]])
-    c, s, eye_x, eye_y, half_x, half_y, dx, dy, disc = of_prism.astype(np.float32)[:, k]
-    ca, sa, disc = rays.cos_a[col], rays.sin_a[col], disc > 0
+    c, s, dx, dy, x, y, half_x, half_y, disc = np.float32(
+        [c, s, dx, dy, x, y, half_x, half_y, p[:, ROUND]])[:, k]
+    ca, sa = rays.cos_a[col], rays.sin_a[col]
     with np.errstate(divide="ignore", invalid="ignore"):
-        # Box: distance along the ray for each metre along the prism's axes, and the two slabs
-        per_x, per_y = 1 / (c * ca + s * sa), 1 / (c * sa - s * ca)
-        middle_x, middle_y = -eye_x * per_x, -eye_y * per_y
-        half_slab_x, half_slab_y = half_x * np.abs(per_x), half_y * np.abs(per_y)
-        box_enter = np.maximum(middle_x - half_slab_x, middle_y - half_slab_y)
-        box_leave = np.minimum(middle_x + half_slab_x, middle_y + half_slab_y)
-        through_x = middle_x - half_slab_x > middle_y - half_slab_y
-        box_facing = 1 / np.where(through_x, np.abs(per_x), np.abs(per_y))
-        # Cylinder: the point nearest to its axis, and half of the chord
-        middle = dx * ca + dy * sa
-        half_chord = np.sqrt(np.maximum(half_x * half_x - (dx * sa - dy * ca) ** 2, 0))
-        enter = np.where(disc, middle - half_chord, box_enter)
-        leave = np.where(disc, middle + half_chord, box_leave)
-        facing = np.where(disc, half_chord / half_x, box_facing)
-    return k, col, enter, leave, facing
+        per_x, per_y = 1 / (c * ca + s * sa), 1 / (c * sa - s * ca)  # way along the ray for 1 m
+        slab_x, slab_y = half_x * np.abs(per_x), half_y * np.abs(per_y)
+        enter_x, enter_y = -x * per_x - slab_x, -y * per_y - slab_y
+        box = (np.maximum(enter_x, enter_y), np.minimum(-x * per_x + slab_x, -y * per_y + slab_y),
+               1 / np.abs(np.where(enter_x > enter_y, per_x, per_y)))
+        middle = dx * ca + dy * sa  # the point nearest to the cylinder's axis
+        half_chord = np.sqrt(np.maximum(half_x**2 - (dx * sa - dy * ca) ** 2, 0))
+        cylinder = middle - half_chord, middle + half_chord, half_chord / half_x
+        enter, leave, facing = np.where(disc > 0, cylinder, box)
+    met = (enter < leave) & (enter > 0.5)
+    return k[met], col[met], enter[met], leave[met], facing[met]
 
 
 def _hit_prisms(p, eye, rays, rng):
@@ -1518,184 +1423,141 @@ def _hit_prisms(p, eye, rays, rng):
     Returns (4,64 A): distance in plan (infinite for no hit), cosine of the angle of incidence,
     albedo, and the depth to which light can get in.
     """
-    f4, h = np.float32, np.float32(eye[2])
-    distance = np.hypot(p[:, X] - eye[0], p[:, Y] - eye[1])
+    distance, h = np.hypot(p[:, X] - eye[0], p[:, Y] - eye[1]), np.float32(eye[2])
     p = p[distance - np.hypot(p[:, HALF_X], p[:, HALF_Y]) < CITY_RANGE]
-    k, col, enter, leave, facing = _cross_prisms(p, eye, rays)
-    z0, z1, fuzz = np.stack([p[:, Z0] - h, p[:, Z1] - h, p[:, FUZZ]]).astype(f4)[:, k]  # (P,)
-    met = (enter < leave) & (enter > 0.5)
+    k, col, enter, leave, facing = _crossings(p, eye, rays)
+    z0, z1, albedo, fuzz = np.float32([p[:, Z0] - h, p[:, Z1] - h, p[:, ALBEDO], p[:, FUZZ]])[:, k]
 
     # Nothing is seen behind a solid prism that stops every beam of its column
-    full = met & (z0 <= 0.01 - h) & (z1 > enter * rays.top[col]) & (fuzz == 0)
-    wall = np.full(len(rays.cos_a), CITY_RANGE, f4)  # (A,) distance to the nearest such prism
+    full = (z0 <= 0.01 - h) & (z1 > enter * rays.slope[col]) & (fuzz == 0)  # of the top beam
+    wall = np.full(len(rays.cos_a), CITY_RANGE, np.float32)  # (A,) distance to such a prism
     np.minimum.at(wall, col[full], enter[full])
-    seen = met & (enter <= wall[col])
-    pairs = k, col, enter, leave, facing, z0, z1, fuzz
-    k, col, enter, leave, facing, z0, z1, fuzz = (values[seen] for values in pairs)
+    seen = enter <= wall[col]
+    col, enter, leave, facing, z0, z1, albedo, fuzz = (
+        values[seen] for values in (col, enter, leave, facing, z0, z1, albedo, fuzz))
 
-    # Candidate beams are those between the lowest and the highest visible edge of a prism. If we
-    # look down on it, the highest is the far edge of its top.
-    def beam_above(slope):
-        sin_e = rays.gain[col] * np.sin(np.arctan(slope) + rays.tilt[col])
-        return np.searchsorted(ELEVATION, np.arcsin(np.clip(sin_e, -1, 1)))
-
-    low = beam_above(z0 / np.where(z0 > 0, leave, enter))
-    high = beam_above(z1 / np.where(z1 > 0, enter, leave))
-    g, beam = _expand_ranges(low, np.maximum(high - low, 0))  # pair and beam of each candidate
+    # Candidates are the beams from the highest to the lowest visible edge of a prism. If we look
+    # down on it, the highest is the far edge of its top.
+    low = rays.beams_below(z0 / np.where(z0 > 0, leave, enter), col)
+    high = rays.beams_below(z1 / np.where(z1 > 0, enter, leave), col)
+    g, beam = _expand_ranges(low, np.maximum(high - low, 0))
+    stops = (fuzz == 0)[g] | (rng.random(len(g), np.float32) > 0.3)  # foliage has holes
+    g, beam = g[stops], beam[stops]
     ray = (63 - beam) * len(rays.cos_a) + col[g]
-    stops = (fuzz == 0)[g] | (rng.random(len(g), dtype=f4) > 0.3)  # foliage has holes
-    g, ray = g[stops], ray[stops]
 
     # A ray hits the face of the prism or, above or below it, its top or its bottom
     slope = rays.slope[ray]
-    z = slope * enter[g]
-    above, below = z > z1[g] + 1e-3, z < z0[g] - 1e-3
+    above, below = slope * enter[g] > z1[g] + 1e-3, slope * enter[g] < z0[g] - 1e-3
     with np.errstate(divide="ignore", invalid="ignore"):
-        level = np.where(above, z1[g], z0[g])
-        reach = np.where(above | below, level / slope, enter[g])
+        reach = np.where(above | below, np.where(above, z1[g], z0[g]) / slope, enter[g])
 
     # Keep the nearest hit of each ray
-    hits = np.zeros((4, len(rays.slope)), f4)
-    d, cosine, albedo, depth = hits  # views of its rows
-    d[:] = np.inf
-    np.minimum.at(d, ray, reach)
-    best = reach <= d[ray]
-    hit, g, level_hit = ray[best], g[best], (above | below)[best]
-    cosine[hit] = np.where(level_hit, np.abs(rays.sin_w[hit]), facing[g] * rays.cos_w[hit])
-    albedo[hit] = p[k, ALBEDO].astype(f4)[g]
-    relief = np.where(z1 - z0 > 3, RELIEF, 0)
-    depth[hit] = np.where(fuzz > 0, fuzz, relief)[g]
+    hits = np.zeros((4, len(rays.slope)), np.float32)
+    hits[0] = np.inf
+    np.minimum.at(hits[0], ray, reach)
+    best = reach <= hits[0, ray]
+    ray, g, on_level = ray[best], g[best], (above | below)[best]
+    relief = np.where(fuzz > 0, fuzz, np.where(z1 - z0 > 3, RELIEF, 0))
+    cosine = np.where(on_level, np.abs(rays.sin_w[ray]), facing[g] * rays.cos_w[ray])
+    hits[1:, ray] = cosine, albedo[g], relief[g]
     return hits
 
 
 def _hit_ground(hits, ground, eye, rays):
     """Add to the `hits` of `_hit_prisms` the ground, for rays that have hit nothing so far.
 
-    The lowest beams hit our own car instead, its bonnet and its boot, and return nothing.
+    The lowest beams hit the bonnet or the boot of our own car instead, and return nothing.
     """
-    d, cosine, shade, _ = hits
-    height, albedo, corner = ground
-    f4, h, azimuth = np.float32, np.float32(eye[2]), len(rays.cos_a)
+    (height, albedo, corner), azimuth, h = ground, len(rays.cos_a), np.float32(eye[2])
     off_axis = np.abs((rays.step * np.arange(azimuth) + np.pi) % (2 * np.pi) - np.pi)
     blocked = np.where(off_axis < 0.4, 6, np.where(off_axis > 2.55, 13, 0))  # number of beams
-    own_car = blocked > np.arange(63, -1, -1)[:, None]  # (64,A)
-    descending = rays.slope < -h / f4(CITY_RANGE)
-    low = np.flatnonzero((d == np.inf) & descending & ~own_car.ravel())
+    own_car = np.arange(64)[:, None] >= 64 - blocked  # (64,A)
+    descending = rays.slope < -h / np.float32(CITY_RANGE)
+    ray = np.flatnonzero((hits[0] == np.inf) & descending & ~own_car.ravel())
 
     # Intersect the ray with the plane z = 0, then twice with the height of the ground found there
-    col, slope = low % azimuth, rays.slope[low]
-    x0, y0 = (eye[:2] - corner).astype(f4)
-    cos_a, sin_a = rays.cos_a[col], rays.sin_a[col]
+    col, slope = ray % azimuth, rays.slope[ray]
+    x0, y0 = np.float32(eye[:2] - corner)
     reach = -h / slope
     for _ in range(2):
-        i = ((x0 + reach * cos_a) / CELL).astype(np.int32)
-        j = ((y0 + reach * sin_a) / CELL).astype(np.int32)
+        i = ((x0 + reach * rays.cos_a[col]) / CELL).astype(int)
+        j = ((y0 + reach * rays.sin_a[col]) / CELL).astype(int)
         reach = (height[i, j] - h) / slope
-    d[low], cosine[low], shade[low] = reach, -rays.sin_w[low], albedo[i, j]
-
-
-def _simulate_scan(name, seed, scans, azimuth, i):
-    """Scan i of a sequence -> (N,4) float32, beam by beam from the top.
-
-    This is fast because a column of rays is one line in plan: its crossing with a prism is computed
-    once for all beams. The heights of the prism's bottom and top then tell which beams hit it.
-    """
-    world = _world(name, seed, scans)
-    R, eye, f4 = world.T[i, :3, :3], world.T_flat[i, :3, 3], np.float32
-    # The random numbers depend on the scan, so it does not matter which process makes it
-    rng = np.random.default_rng([seed, zlib.crc32(name.encode()), i])
-    rays = _Rays(world.T_flat[i, :3, :3], azimuth, rng)
-    hits = _hit_prisms(np.concatenate([world.prisms, world.moving(i)]), eye, rays, rng)
-    _hit_ground(hits, world.ground, eye, rays)
-    ray, r, intensity = _returns(hits, eye, rays, rng)  # (N,) each
-
-    # Points relative to the eye along the axes of the world. The hills lift them: a crest does not
-    # hide anything.
-    d, col = r * rays.cos_w[ray], ray % azimuth
-    x, y, z = d * rays.cos_a[col], d * rays.sin_a[col], r * rays.sin_w[ray]
-    lift = world.height(x + f4(eye[0]), y + f4(eye[1])) - world.height(*eye[:2])
-    z += lift.astype(f4)
-    # Rotate them by R^T to the sensor's axes; without BLAS, whose sums depend on its threads
-    points = [x * row[0] + y * row[1] + z * row[2] for row in R.T.astype(f4)]
-    return np.stack([*points, intensity], axis=1)  # (N,4)
+    hits[:3, ray] = reach, -rays.sin_w[ray], albedo[i, j]
 
 
 def _returns(hits, eye, rays, rng):
     """What the sensor measures of the `hits` of all rays.
 
-    Returns indices of the rays that return a point, their ranges [m] and intensities, (N,) each.
+    Returns the numbers of the rays that return a point, their ranges [m] and intensities, (N,)
+    each.
     """
-    f4 = np.float32
     ray = np.flatnonzero(hits[0] < CITY_RANGE)  # (M,)
     col = ray % len(rays.cos_a)
-    d, cosine, albedo, depth = hits[:, ray]  # (M,) each
-
-    def noise():
-        return rng.standard_normal(len(ray), dtype=f4)
-
-    def uniform():
-        return rng.random(len(ray), dtype=f4)
+    d, cosine, albedo, depth = hits[:, ray]
+    noise, uniform = (functools.partial(draw, len(ray), np.float32)
+                      for draw in (rng.standard_normal, rng.random))
 
     # Range. Light gets into foliage, or into the windows and doors of a facade, by a depth that is
     # random for each cell of 0.6 m but the same in every scan.
     directions = rays.cos_a[col], rays.sin_a[col], rays.slope[ray]  # for each metre in plan
-    a, b, c = (np.floor((start + d * direction) / 0.6).astype(np.int64)  # number of the cell
-               for start, direction in zip(eye, directions))
-    rough = ((a * 73856093 ^ b * 19349663 ^ c * 83492791) % 1009).astype(f4) / 1009  # 0 to 1
-    r = d / rays.cos_w[ray] + 0.02 * noise()
-    r += depth * (0.8 * rough + 0.2 * uniform())
+    a, b, c = (np.floor((start + d * direction) / 0.6).astype(int)
+               for start, direction in zip(eye, directions))  # number of the cell
+    rough = np.float32((a * 73856093 ^ b * 19349663 ^ c * 83492791) % 1009) / 1009  # 0 to 1
+    r = d / rays.cos_w[ray] + 0.02 * noise() + depth * (0.8 * rough + 0.2 * uniform())
 
-    # Intensity. From 60 m on, KITTI's intensities are mostly 0.
+    # Intensity. From 60 m on, KITTI's intensities are mostly 0; elsewhere 8 % are.
     light = albedo * (0.65 + 0.4 * np.sqrt(cosine)) + 0.08 * noise() - 0.01 * np.maximum(r - 25, 0)
-    light[uniform() <= 0.08] = 0  # some are lost
-
-    # Drop-outs: far and dark, grazing, or very dark
+    light = np.where(uniform() > 0.08, light, 0)
+    # Lost returns: far and dark, grazing, or very dark
     far = 0.10 * (r / 40) ** 2 * (0.15 / (0.05 + albedo))
     lost = 0.01 + far + 0.3 * np.exp(-cosine / 0.02) + 0.5 * np.exp(-albedo / 0.03)
     returned = (uniform() > lost) & (r < CITY_RANGE) & (r > MIN_RANGE)
-    intensity = np.round(np.clip(light, 0, 0.99), 2)
-    return ray[returned], r[returned], intensity[returned]
+    return ray[returned], r[returned], np.round(np.clip(light, 0, 0.99), 2)[returned]
+
+
+def _simulate_scan(world, rng, azimuth, i):
+    """Scan i -> (N,4) float32, beam by beam from the top.
+
+    This is fast because a column of rays is one line in plan: its crossing with a prism is computed
+    once for all beams. The heights of the prism's bottom and top then tell which beams hit it.
+    """
+    R, R_flat, eye = world.T[i, :3, :3], world.T_flat[i, :3, :3], world.T_flat[i, :3, 3]
+    rays = _Rays(R_flat, azimuth, rng)
+    hits = _hit_prisms(np.concatenate([world.prisms, world.moving(i)]), eye, rays, rng)
+    _hit_ground(hits, world.ground, eye, rays)
+    ray, r, intensity = _returns(hits, eye, rays, rng)
+
+    # Points relative to the eye along the axes of the world. The hills lift them: a crest does not
+    # hide anything.
+    d, col = r * rays.cos_w[ray], ray % azimuth
+    x, y, z = d * rays.cos_a[col], d * rays.sin_a[col], r * rays.sin_w[ray]
+    lift = world.height(x + np.float32(eye[0]), y + np.float32(eye[1])) - world.height(*eye[:2])
+    z += np.float32(lift)
+    # Rotate them by R^T to the sensor's axes; without BLAS, whose sums depend on its threads
+    points = [x * row[0] + y * row[1] + z * row[2] for row in np.float32(R.T)]
+    return np.stack([*points, intensity], axis=1)
 
 
 # Writing sequences
+
+_world = functools.lru_cache(maxsize=1)(_World)
+# As in KITTI, the camera looks along the Velodyne's x axis, 8 cm lower and 27 cm ahead. It is
+# turned by a fraction of a degree.
+_TURN = Rotation.from_euler("xyz", [0.4, -0.5, 0.3], degrees=True).as_matrix()
+_TR = rigid(_TURN @ [[0, -1, 0], [0, 0, -1], [1, 0, 0]], [-0.012, -0.076, -0.272])
+_CAMERAS = [f"P{i}: 718.856 0 607.193 {x} 0 718.856 185.216 0 0 0 1 0\n"
+            for i, x in enumerate((0, -386.1, 45.4, -337.3))]
 
 
 def _save_scan(task):
     """Simulate a scan and write it; task: path, sequence, settings, number of the scan."""
     path, name, settings, i = task
-    scan = _simulate_scan(name, settings["seed"], settings["scans"], settings["azimuth"], i)
+    world = _world(name, settings["seed"], settings["scans"])
+    # The random numbers depend on the scan, so it does not matter which process makes it
+    rng = np.random.default_rng([settings["seed"], zlib.crc32(name.encode()), i])
     with replacing(path) as temporary:
-        temporary.write_bytes(scan.tobytes())
-
-
-def _calibration():
-    """Tr (4,4), and the text of calib.txt.
-
-    As in KITTI, the camera looks along the Velodyne's x axis. It is turned by a fraction of a
-    degree, 8 cm lower than the Velodyne and 27 cm ahead of it.
-    """
-    axes = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]  # from x forward, y left, z up to the camera's
-    turn = Rotation.from_euler("xyz", [0.4, -0.5, 0.3], degrees=True).as_matrix()
-    Tr = np.eye(4)
-    Tr[:3, :3] = turn @ axes
-    Tr[:3, 3] = [-0.012, -0.076, -0.272]
-    rows = {}
-    for name, x in (("P0", 0), ("P1", -386.1), ("P2", 45.4), ("P3", -337.3)):
-        rows[name] = np.array([[718.856, 0, 607.193, x], [0, 718.856, 185.216, 0], [0, 0, 1, 0]])
-    rows["Tr"] = Tr[:3]
-    lines = []
-    for name, matrix in rows.items():
-        numbers = " ".join(f"{x:.12e}" for x in matrix.ravel())
-        lines.append(f"{name}: {numbers}\n")
-    return Tr, "".join(lines)
-
-
-def default_scans(name):
-    """Number of scans that `simulate` makes for a sequence unless told otherwise.
-
-    Test and validation sequences are long enough for segments of 100 m, but quick to make.
-    """
-    return 170 if name in SPLITS["test"] + SPLITS["validation"] else 320
+        temporary.write_bytes(_simulate_scan(world, rng, settings["azimuth"], i).tobytes())
 
 
 def _is_complete(root, name, settings):
@@ -1705,20 +1567,15 @@ def _is_complete(root, name, settings):
         return False
     made = folder / "simulated.json"
     found = made.read_text() if made.exists() else "not simulated"
-    city = re.match(r'\{"city": (\d+)', found)
-    if city and int(city[1]) != CITY:
-        raise ValueError(f"{root} has scans of the simulated city, version {city[1]}, but this "
-                         f"code makes version {CITY}: delete or rename that folder, then run the "
-                         "same command again.")
     if found != json.dumps(settings) or not truth.exists():
         raise ValueError(f"{folder} or {truth} is there already, {found} and not "
-                         f"{json.dumps(settings)}: choose another folder.")
+                         f"{json.dumps(settings)}: delete it, or choose another folder.")
     return True
 
 
 def _simulate_sequence(root, name, settings, workers):
     """Write ROOT/sequences/NAME and ROOT/poses/NAME.txt. The folder appears when complete."""
-    T, (Tr, calib) = _world(name, settings["seed"], settings["scans"]).T, _calibration()
+    T = _world(name, settings["seed"], settings["scans"]).T
     with new_folder(root / "sequences" / name) as folder:
         (folder / "velodyne").mkdir()
         tasks = [(folder / "velodyne" / f"{i:06d}.bin", name, settings, i) for i in range(len(T))]
@@ -1726,10 +1583,9 @@ def _simulate_sequence(root, name, settings, workers):
         saved = map(_save_scan, tasks) if alone else in_processes(_save_scan, tasks, workers, 8)
         for _ in progress(saved, len(tasks), f"simulating {name}, scans"):
             pass
-        (folder / "calib.txt").write_text(calib)
-        (folder / "times.txt").write_text("".join(f"{0.1 * i:.6e}\n" for i in range(len(T))))
+        _write_calib_and_times(folder, _TR, 0.1 * np.arange(len(T)), _CAMERAS)
         (folder / "simulated.json").write_text(json.dumps(settings))
-        write_poses(root / "poses" / f"{name}.txt", velo_to_camera(invert(T[0]) @ T, Tr))
+        write_poses(root / "poses" / f"{name}.txt", velo_to_camera(invert(T[0]) @ T, _TR))
 
 
 def simulate(root: str | Path, seed=0, sequences="all", scans=None, azimuth=1800,
@@ -1755,10 +1611,10 @@ def simulate(root: str | Path, seed=0, sequences="all", scans=None, azimuth=1800
         if not isinstance(name, str) or name in ("", ".", "..") or re.search(r"[/\\\0]", name):
             raise ValueError(f"The sequence name {name!r} is no plain folder name: use one such "
                              "as '00'.")
-    settings = {name: {"city": CITY, "seed": int(seed), "scans": int(scans or default_scans(name)),
-                       "azimuth": int(azimuth)} for name in names}
-    missing = [name for name in names if not _is_complete(root, name, settings[name])]
-    for name in missing:
+    default = dict.fromkeys(SPLITS["test"] + SPLITS["validation"], 170)
+    settings = {name: dict(city=CITY, seed=int(seed), scans=int(scans or default.get(name, 320)),
+                           azimuth=int(azimuth)) for name in names}
+    for name in [name for name in names if not _is_complete(root, name, settings[name])]:
         try:
             _simulate_sequence(root, name, settings[name], workers or cores())
         except OSError:

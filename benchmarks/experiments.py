@@ -3,6 +3,7 @@
     python benchmarks/experiments.py table2 --dry-run      # list the runs
     python benchmarks/experiments.py loss coordinates      # simulated city, 10,000 pair-steps a run
     python benchmarks/experiments.py table2 table3 --data ROOT --budget 8000000 --seeds 0 1 2
+    python benchmarks/experiments.py ablation --real ROOT  # our additions, scored on real clips too
 
 The first half holds what the paper tried and rejected, as losses and as subclasses of D3DLO. They
 are passed to `d3dlo.train` as its `objective` and its `network`.
@@ -183,17 +184,21 @@ class Coordinates(D3DLO):
 
 
 class Variant(NamedTuple):
-    """A row of a table, or one row for each split the paper reports."""
+    """A row of a table, or one row for each split it is measured on."""
 
-    paper: str | dict = ""  # the paper's words, or {split: its E_t [%] and E_r [deg/m]}
+    paper: str | dict | tuple = ""  # the paper's words, {split: its E_t [%] and E_r [deg/m]},
+    # or only the splits
     changes: dict = {}  # what differs from Config(**SHORT)
     network: type = D3DLO
     objective: Callable[[], nn.Module] = nn.L1Loss
+    aligned: float = d3dlo.ALIGNED  # share of pairs that imitate refinement, with augmentation
 
     def splits(self):
         """{split: the paper's two cells} of the splits it is measured on."""
         if isinstance(self.paper, dict):
             return {split: (f"{E_t}", f"{E_r:.5f}") for split, (E_t, E_r) in self.paper.items()}
+        if isinstance(self.paper, tuple):
+            return dict.fromkeys(self.paper, ("", ""))
         return {"test": (self.paper, "")}
 
 
@@ -215,6 +220,12 @@ def row_of_table_2(n_n, plane, paper):
     """The name and the Variant of a combination of n_n and plane."""
     name = f"n_n = {n_n}, {'with' if plane else 'without'} plane"
     return name, Variant(paper, dict(sa1=T1.sa1._replace(n_n=n_n), plane=plane))
+
+
+def without(aligned=d3dlo.ALIGNED, **changes):
+    """A row of the ablation: our recipe with changes, scored plain and refined."""
+    splits = "test", "test, refined", "real", "real, refined"
+    return Variant(splits, changes, aligned=aligned)
 
 
 EXPERIMENTS = {
@@ -243,6 +254,18 @@ EXPERIMENTS = {
     "swap": {
         "both directions": Variant(),
         "one direction at random": Variant("used", RANDOM)},
+    "ablation": {
+        "our recipe": without(),
+        "Adam": without(optimizer="adam"),
+        "Adam, rate up to 0.003": without(optimizer="adam", lr=3e-3),
+        "decays instead of one cycle": without(schedule="steps"),
+        "one direction at random": without(**RANDOM),
+        "no augmentation": without(augment=False),
+        "no aligned pairs": without(aligned=0.0),
+        "no fixed statistics": without(frozen=0.0),
+        "all points": without(max_range=None),
+        "the paper's recipe": without(**RANDOM, max_range=None, optimizer="adam", lr=T1.lr,
+                                      schedule="steps", augment=False, frozen=0.0)},
 }
 
 # ------------------------------------------------------------------------------------------------
@@ -258,9 +281,9 @@ class Run(NamedTuple):
     seed: int
     folder: Path
 
-    def results(self):
-        """The content of results.json, or {} if the run is not finished."""
-        path = self.folder / "all" / "results.json"
+    def results(self, name):
+        """The content of results.json of an evaluation, or {} if it is not finished."""
+        path = self.folder / name / "results.json"
         content = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
         return content if "pooled" in content else {}
 
@@ -286,7 +309,7 @@ def plan(experiments, pairs, budget, seeds, out, data):
         variant = EXPERIMENTS[experiment][name]
         config = config_of(variant.changes, pairs, budget)
         depends = (config.as_dict(), variant.network.__name__, repr(variant.objective()), seed,
-                   d3dlo.__version__, data)
+                   variant.aligned, d3dlo.__version__, data)
         key = hashlib.sha256(json.dumps(depends, sort_keys=True).encode()).hexdigest()[:12]
         return Run(experiment, name, config, seed, out / key)
 
@@ -294,14 +317,31 @@ def plan(experiments, pairs, budget, seeds, out, data):
                          for name in EXPERIMENTS[experiment]} for experiment in experiments}
 
 
-def execute(run, root, trained, evaluated):
-    """Start or resume a training run, then evaluate it on the sequences `evaluated`."""
+def evaluations(run, root, sequences, real):
+    """{folder: (data, sequences, refinement passes)} of the evaluations of a Run.
+
+    The rows of the ablation are also refined, and scored on the real scans in the folder `real`.
+    """
+    every = {"all": (root, sequences, 0)}
+    if run.experiment == "ablation":
+        every["all-refined"] = root, ["test"], 3
+        if real:
+            every |= {"real": (real, ["all"], 0), "real-refined": (real, ["all"], 3)}
+    return every
+
+
+def execute(run, root, trained, every):
+    """Start or resume a training run, then make those of its evaluations that are missing."""
     variant = EXPERIMENTS[run.experiment][run.variant]
-    d3dlo.train(run.config, root, trained, run.folder, run.seed, network=variant.network,
-                objective=variant.objective(), resume=(run.folder / "config.json").exists())
-    shutil.rmtree(run.folder / "all", ignore_errors=True)  # of an interrupted evaluation
-    d3dlo.evaluate(root, run.folder, evaluated, run.folder / "all", network=variant.network,
-                   say=lambda text: None)
+    if not run.results("all"):
+        d3dlo.ALIGNED = variant.aligned
+        d3dlo.train(run.config, root, trained, run.folder, run.seed, network=variant.network,
+                    objective=variant.objective(), resume=(run.folder / "config.json").exists())
+    for name, (data, sequences, refine) in every.items():
+        if not run.results(name):
+            shutil.rmtree(run.folder / name, ignore_errors=True)  # of an interrupted evaluation
+            d3dlo.evaluate(data, run.folder, sequences, run.folder / name, refine=refine,
+                           network=variant.network, say=lambda text: None)
 
 
 # ------------------------------------------------------------------------------------------------
@@ -314,8 +354,10 @@ HEADER = ["", "split", "paper's E_t [%]", "paper's E_r [deg/m]",
 
 def figures(run, split):
     """E_t, E_r, t step and r step of a Run on a split, a dict. NaN without a segment or split."""
-    results = run.results()
-    result = results["pooled"] if split == "all" else results["splits"].get(split, {})
+    name, _, refined = split.partition(", ")  # "test, refined"
+    results = run.results(("real" if name == "real" else "all") + "-refined" * bool(refined))
+    pooled = results.get("pooled", {})
+    result = pooled if name in ("all", "real") else results.get("splits", {}).get(name, {})
     return {key: math.nan if result.get(key) is None else result[key] for key in DIGITS}
 
 
@@ -391,6 +433,7 @@ def command_line():
     add("--seeds", nargs="+", type=int, default=[0, 1], metavar="N", help="default: 0 1")
     add("--out", type=Path, default=Path("runs/experiments"), metavar="OUT",
         help="folder of the runs and of NAME.json, the figures (default: runs/experiments)")
+    add("--real", metavar="ROOT", help="real scans, to score the ablation on")
     add("--dry-run", action="store_true", help="list the runs and the size of their caches")
     return parser.parse_args()
 
@@ -406,12 +449,15 @@ def main():
     trained, pairs = [s.name for s in chosen], sum(len(s.motions()) for s in chosen)
     for experiment in args.experiments:
         for split in next(iter(EXPERIMENTS[experiment].values())).splits():
-            kitti.open_sequences(root, split)  # ValueError if ROOT has none of its sequences
+            if "real" not in split:  # ValueError if ROOT has none of its sequences
+                kitti.open_sequences(root, split.split(", ")[0])
 
+    names = [s.name for s in sequences]
     data = trained, {s.name: identity(s) for s in sequences}
     planned = plan(args.experiments, pairs, args.budget, args.seeds, args.out, data)
     runs = {run.folder: run for rows in planned.values() for row in rows.values() for run in row}
-    todo = [run for run in runs.values() if not run.results()]
+    wanted = {folder: evaluations(run, root, names, args.real) for folder, run in runs.items()}
+    todo = [run for folder, run in runs.items() if not all(map(run.results, wanted[folder]))]
     steps = 2 * pairs * config_of({}, pairs, args.budget).epochs
     facts = (f"{root}: trained on {' '.join(trained)} ({pairs:,} pairs), {steps:,} pair-steps a "
              f"run, seeds {' '.join(map(str, args.seeds))}")
@@ -419,9 +465,10 @@ def main():
     for run in todo:
         print(f"{run.experiment}: {run.variant}, seed {run.seed} -> {run.folder}", flush=True)
         if not args.dry_run:
-            execute(run, root, trained, [s.name for s in sequences])
+            execute(run, root, trained, wanted[run.folder])
     if args.dry_run:
-        caches = {(run.config.sa1, run.config.plane): run.config for run in todo}.values()
+        caches = {(run.config.sa1, run.config.plane, run.config.max_range): run.config
+                  for run in todo}.values()
         size = sum(map(len, sequences)) * sum(d3dlo.record_dtype(c).itemsize for c in caches)
         return print(f"size of the caches: {size / 1e9:.1f} GB")
 
