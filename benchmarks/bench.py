@@ -119,6 +119,16 @@ def training(s, form, frozen=0.0):
     return np.median(np.diff(times[WARM_UP - 1:EPOCHS])) / (2 * len(motions))
 
 
+def loader(s, form):
+    """Preparing a batch, a pair-step. "eq. 4 on the device" leaves neighbours in Q to the device.
+
+    The device "meta" computes nothing, so what is left is the work of the CPU beside a GPU.
+    """
+    device, steps = "cpu" if form == "here" else "meta", 20
+    data, work = [prepare(s)], (CONFIG, (0,), 0, steps)
+    return seconds(lambda: [*d3dlo.batches(data, *work, device)], 3) / (2 * CONFIG.batch * steps)
+
+
 def inference(s, form):
     """The network on one of 32 pairs in a batch. The records are given."""
     records, _ = prepare(s)
@@ -166,6 +176,7 @@ ROWS = {  # measurement, its name in the table, baselines
     "refine": (functools.partial(register, refine=3), "the same, refine=3", "KISS-ICP"),
     "training": (training, "training, a pair-step in a batch of 32"),
     "fixed": (functools.partial(training, frozen=0.999), "the same, fixed statistics"),
+    "loader": (loader, "preparing batches, a pair-step", "eq. 4 on the device"),
     "inference": (inference, "network on a pair, records given"),
     "cache": (cache, "sampling and grouping, a sequence", "one worker"),
     "startup": (startup, "d3dlo.py --help", "import torch"),
