@@ -1286,7 +1286,7 @@ def command_line(argv):
         "(default: 0)"))
     add("--plot", action="store_true", help=(
         "draw the paths and the errors by length; needs matplotlib"))
-    return vars(parser.parse_args(argv))
+    return vars(parser.parse_args((sys.argv[1:] if argv is None else argv) or ["--help"]))
 
 
 def config_from(args):

@@ -120,6 +120,7 @@ def from_vector(v: np.ndarray) -> np.ndarray:
 # Scans, calibration and sequences
 
 OTHER_FORMATS = b"\x93NUMPY", b"ply\n", b"ply\r", b"# .PCD"  # how files of other formats begin
+OTHER_SUFFIXES = ".pcd", ".ply", ".las", ".bag", ".mcap", ".db3"
 OTHER_COLUMNS = {  # what else a .bin file may hold: NumPy type, number of columns
     "five floats per point, as in nuScenes": ("float32", 5), "float64": ("float64", 4),
     "six floats per point": ("float32", 6), "eight floats per point": ("float32", 8)}
@@ -398,14 +399,14 @@ def sequence_names(root: str | Path) -> list[str]:
         return names
     if not root.exists():
         raise FileNotFoundError(f"{root}: no such folder; check the path.")
-    if root.is_file():
-        raise FileNotFoundError(f"{root} is a file: give the folder that holds the scans.")
     remedy = "check the path and unpack its archives"
     paths = root, *root.glob("*"), *root.glob("*/*")
     if any(re.search(r"_drive_\d+|^velodyne_points$", path.name) for path in paths):
         remedy = "convert KITTI's raw data with `python kitti.py raw DRIVE ROOT`"
-    elif any(path.suffix.lower() in (".pcd", ".ply", ".las") for path in paths):
-        remedy = "save the points of each file as .npy, (N,4): x, y, z, intensity"
+    elif any(path.suffix.lower() in OTHER_SUFFIXES for path in paths):
+        remedy = "save every scan as .npy, (N,4): x, y, z, intensity, as in docs/your-data.md"
+    elif root.is_file():
+        raise FileNotFoundError(f"{root} is a file: give the folder that holds the scans.")
     raise FileNotFoundError(
         f"{root} has no scans in a known layout: {remedy}. Known layouts: a folder of *.bin or "
         "*.npy files, and KITTI's odometry layout, ROOT/sequences/00/{velodyne/000000.bin, "

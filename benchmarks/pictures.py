@@ -1,7 +1,7 @@
 """Draws the pictures of the documentation. Needs matplotlib: pip install ".[plot]"
 
+    python benchmarks/pictures.py tour docs/tour.ipynb        # run the notebook, keep its outputs
     python benchmarks/pictures.py network docs/network.png    # Fig. 1 with shapes and parameters
-    python benchmarks/pictures.py method docs/method.png data/simulated --sequences 03 --scan 60
     python benchmarks/pictures.py curve docs/curve.png RUN    # loss by epoch of a training run
     python benchmarks/pictures.py table2 docs/table2.png runs/experiments
 
@@ -9,6 +9,7 @@ Trajectories and errors come from two evaluations of the same data, plain and re
 
     python d3dlo.py eval --data ROOT --out P && python d3dlo.py eval --data ROOT --refine 3 --out R
     python benchmarks/pictures.py paths docs/paths.png ROOT P R --sequences 03 04 06
+    python benchmarks/pictures.py cloud docs/cloud.png ROOT R --sequences 05
 
 The errors of KISS-ICP on the same data come from benchmarks/classical.py:
 
@@ -16,6 +17,9 @@ The errors of KISS-ICP on the same data come from benchmarks/classical.py:
     python benchmarks/pictures.py steps docs/steps.png P R K    # real drives
 """
 import argparse
+import base64
+import contextlib
+import io
 import json
 import re
 import sys
@@ -35,65 +39,29 @@ COLOURS = {"truth": "0.6", "plain": "tab:orange", "refined": "tab:blue", "KISS-I
 TRUTH_NOISE = {"drive0013": 0.015, "drive0005": 0.024}
 
 
-def scatter(axis, points, size, color, **style):
-    """Draw points (n,3) from above, with the x axis up: the vehicle drives upwards."""
-    axis.scatter(points[:, 1], points[:, 0], s=size, color=color, linewidths=0, **style)
+def tour(notebook):
+    """Run the cells of a notebook, and store what they print and draw in it."""
+    import matplotlib.pyplot as plt  # only here, since it chooses a backend
 
-
-def window(axis, centre, half, title):
-    """Show a square of 2 * half metres around centre, in the Velodyne frame."""
-    x, y = centre[:2]
-    axis.set(title=title, xlabel="y [m]", ylabel="x [m]", aspect="equal",
-             xlim=(y + half, y - half), ylim=(x - half, x + half))
-
-
-def draw_ball(axis, points, neighbours, centroid, r, title):
-    """Draw the points around a centroid, its neighbours, and the ball of radius r."""
-    scatter(axis, points, 3, "0.7")
-    scatter(axis, neighbours, 14, "black")
-    turn = np.linspace(0, 2 * np.pi, 100)
-    axis.plot(centroid[1] + r * np.sin(turn), centroid[0] + r * np.cos(turn), color="0.4", lw=0.8)
-    axis.plot(centroid[1], centroid[0], "k+", ms=12)
-    window(axis, centroid, 1.6 * r, title)
-
-
-def draw_flow(axis, xyz_p, xyz_q, centroid, k):
-    """Draw a centroid of P and its k neighbours among the centroids of Q."""
-    neighbours = xyz_q[d3dlo.group_knn(xyz_q, centroid[None], k)[0]]
-    axis.scatter(xyz_q[:, 1], xyz_q[:, 0], s=14, facecolors="none", edgecolors="0.5",
-                 linewidths=0.8, label="Q")
-    scatter(axis, xyz_p, 10, "black", label="P")
-    for y in neighbours:
-        axis.plot([centroid[1], y[1]], [centroid[0], y[0]], color="0.2", lw=0.7)
-    axis.legend(frameon=False, loc="upper right")
-    half = 1.3 * np.abs(neighbours - centroid)[:, :2].max()
-    window(axis, centroid, half, f"FE: {k} neighbours in Q")
-
-
-def method(root, sequences, i):
-    """Draw the centroids of scan i, a ball of SA1 and of SA2, and a group of the flow embedding."""
-    config, s = d3dlo.load_weights()[0].config, kitti.open_sequences(root, sequences)[0]
-    if not 0 <= i < len(s) - 1:
-        raise ValueError(f"sequence {s.name} has {len(s)} scans; --scan must be 0 to {len(s) - 2}")
-    scan = s.scan(i)
-    (p,), (q,) = d3dlo.scan_records(scan, config), d3dlo.scan_records(s.scan(i + 1), config)
-    xyz, sa1, sa2 = p["xyz"], config.sa1, config.sa2
-    ranges = np.linalg.norm(xyz[:sa2.n_fps, :2], axis=1)
-    on_ground = xyz[:sa2.n_fps, 2] < -1
-    j = np.argmin(np.abs(ranges - 12) + 10 * on_ground)  # something upright, about 12 m away
-
-    figure = metrics.new_figure(14, 3.9)
-    whole, ball1, ball2, flow = figure.subplots(1, 4)
-    scatter(whole, scan, 0.3, "0.6")
-    scatter(whole, xyz, 4, "black")
-    window(whole, (0, 0), 45, f"a scan, its {len(xyz):,} centroids")
-    neighbours = xyz[j] + p["group_sa1"][j][:, 1:]  # group holds intensity and x_i - x'_j
-    draw_ball(ball1, scan, neighbours, xyz[j], sa1.r,
-              f"SA1: {sa1.n_n} of the points within {sa1.r:.0f} m")
-    draw_ball(ball2, xyz, xyz[p["idx_sa2"][j]], xyz[j], sa2.r,
-              f"SA2: centroids within {sa2.r:.0f} m")
-    draw_flow(flow, xyz, q["xyz"], xyz[j], config.fe.n_n)
-    return figure
+    content, names = json.loads(notebook.read_text(encoding="utf-8")), {}
+    for number, cell in enumerate(content["cells"]):
+        if cell["cell_type"] != "code":
+            continue
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            exec(compile("".join(cell["source"]), f"cell {number}", "exec"), names)
+        text, cell["outputs"] = printed.getvalue(), []
+        if text:
+            cell["outputs"].append({"output_type": "stream", "name": "stdout",
+                                    "text": text.splitlines(True)})
+        for figure in map(plt.figure, plt.get_fignums()):
+            picture = io.BytesIO()
+            figure.savefig(picture, format="png", dpi=70, bbox_inches="tight")
+            image = base64.b64encode(picture.getvalue()).decode()
+            cell["outputs"].append({"output_type": "display_data", "metadata": {},
+                                    "data": {"image/png": image}})
+        plt.close("all")
+    text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+    notebook.write_text(text, encoding="utf-8")
 
 
 def network():
@@ -138,7 +106,7 @@ def network():
 
 
 def paths(root, plain, refined, sequences):
-    """Draw the true and the predicted paths of sequences from above, all at the same scale."""
+    """Draw the true and the predicted paths of sequences from above."""
     drives = kitti.open_sequences(root, sequences)
     estimates = {label: [metrics.read_poses(folder / f"{s.name}.txt") for s in drives]
                  for label, folder in (("plain", plain), ("refined", refined))}
@@ -154,13 +122,44 @@ def paths(root, plain, refined, sequences):
         simulated = "simulated " * (s.folder / "simulated.json").exists()
         axis.set(title=f"{simulated}{s.name}, {metrics.path_lengths(s.poses_cam)[-1]:,.0f} m. "
                  f"Off at the end:\nplain {off[0]:.1f} m, refined {off[1]:.1f} m",
-                 xlabel="to the right [m]", ylabel="forward [m]", aspect="equal")
+                 xlabel="to the right [m]", ylabel="forward [m]")
+        axis.set_aspect("equal", adjustable="datalim")
         axis.grid(color="0.9")
-    limits = np.array([[axis.get_xlim(), axis.get_ylim()] for axis in axes])  # (drives,2,2)
-    half = np.ptp(limits, axis=2).max() / 2  # the same scale for all
-    for axis, (x, y) in zip(axes, limits.mean(2)):
-        axis.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
     axes[0].legend(frameon=False)
+    return figure
+
+
+def cloud(root, refined, sequences):
+    """Draw the scans of a sequence in its predicted poses, from an angle, coloured by height."""
+    s = kitti.open_sequences(root, sequences)[0]
+    T = kitti.camera_to_velo(metrics.read_poses(refined / f"{s.name}.txt"), s.Tr)  # (n,4,4)
+    parts = []
+    for i in range(len(s)):
+        scan = s.scan(i)[:, :3]
+        scan = scan[np.linalg.norm(scan, axis=1) < 35]
+        parts.append(np.c_[scan @ T[i, :3, :3].T + T[i, :3, 3], scan[:, 2] + kitti.SENSOR_HEIGHT])
+    points = np.concatenate(parts)  # (m,4): position, and height above the road
+    _, first = np.unique(np.round(points[:, :3] / 0.15), axis=0, return_index=True)
+    points, path = points[first], T[:, :3, 3]
+
+    # Turn the long side of the path to the right, then look down at an angle of 40 degrees
+    centred = path[:, :2] - path[:, :2].mean(0)
+    right = np.linalg.svd(centred, full_matrices=False)[2][0]  # (2,)
+    axes = np.array([[*right, 0], [*(np.array([-right[1], right[0]]) * np.sin(np.radians(40))),
+                                   np.cos(np.radians(40))]])  # (2,3): to the right, upwards
+    ahead = points[:, :2] @ [-right[1], right[0]]
+    points = points[np.argsort(-ahead)]  # the nearest ones are drawn last
+    u, v = axes @ points[:, :3].T
+    figure = metrics.new_figure(10, 10 * np.ptp(v) / np.ptp(u) + 0.6)
+    figure.set_facecolor("black")
+    axis = figure.subplots()
+    axis.set_aspect("equal")
+    axis.axis("off")
+    axis.scatter(u, v, s=0.25, c=points[:, 3], cmap="turbo", vmin=-1, vmax=6, linewidths=0)
+    axis.plot(*(axes @ path.T), color="white", lw=1.5)
+    simulated = "simulated " * (s.folder / "simulated.json").exists()
+    axis.set_title(f"{simulated}drive {s.name}: {len(s)} scans in the predicted poses, a path of "
+                   f"{metrics.path_lengths(T)[-1]:,.0f} m", color="white")
     return figure
 
 
@@ -234,7 +233,8 @@ def table2(out):
     return figure
 
 
-FOLDERS = {network: [], method: ["root"], paths: ["root", "plain", "refined"],
+FOLDERS = {tour: [], network: [], paths: ["root", "plain", "refined"],
+           cloud: ["root", "refined"],
            steps: ["plain", "refined", "classical"], curve: ["run"], table2: ["out"]}
 
 
@@ -246,13 +246,11 @@ def command_line():
     for draw, folders in FOLDERS.items():
         command = commands.add_parser(draw.__name__, description=draw.__doc__)
         command.set_defaults(draw=draw)
-        command.add_argument("picture", type=Path, metavar="FILE", help="the picture to write, PNG")
+        command.add_argument("picture", type=Path, metavar="FILE", help="the file to write")
         for folder in folders:
             command.add_argument(folder, type=Path, metavar=folder.upper())
         if "root" in folders:
             command.add_argument("--sequences", nargs="+", default="all", metavar="NN")
-        if draw is method:
-            command.add_argument("--scan", type=int, default=60, metavar="N", dest="i")
     args = vars(parser.parse_args())
     args.pop("command")
     return args.pop("draw"), args.pop("picture"), args
@@ -262,9 +260,12 @@ def main():
     """Run the command line."""
     draw, picture, args = command_line()
     try:
-        figure = draw(**args)
-        with metrics.replacing(picture) as temporary:
-            figure.savefig(temporary, format="png", dpi=100)
+        if draw is tour:
+            tour(picture)
+        else:
+            figure = draw(**args)
+            with metrics.replacing(picture) as temporary:
+                figure.savefig(temporary, format="png", dpi=100)
     except (ValueError, OSError) as error:
         sys.exit(f"pictures: {error}")
     except KeyError as error:
