@@ -313,7 +313,7 @@ class Sequence:
             self._note_gaps(self.times, "times.txt")
         else:
             self.times = 0.1 * np.arange(len(self))
-            self.notes.append("no times.txt (one time in seconds per line); "
+            self.notes.append("no times.txt among the scans (one time in seconds per line); "
                               "10 scans a second are assumed")
 
     def _note_gaps(self, numbers, source):
@@ -405,6 +405,8 @@ def sequence_names(root: str | Path) -> list[str]:
         remedy = "convert KITTI's raw data with `python kitti.py raw DRIVE ROOT`"
     elif any(path.suffix.lower() in OTHER_SUFFIXES for path in paths):
         remedy = "save every scan as .npy, (N,4): x, y, z, intensity, as in docs/your-data.md"
+    elif any(path.name == "velodyne" for path in paths):
+        remedy = "give the folder that holds sequences/, or only a folder velodyne"
     elif root.is_file():
         raise FileNotFoundError(f"{root} is a file: give the folder that holds the scans.")
     raise FileNotFoundError(

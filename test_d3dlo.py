@@ -1457,6 +1457,7 @@ CASES = [  # commands, and {what the message must say: what spoils good data}
 BAD_ARGUMENTS = {
     "eval --data ''": "--data is empty; give", "eval --data gone": "gone: .*check",
     "eval --data w.pt": "w.pt is a file: give", "eval --data clouds": "clouds.*save .* as .npy",
+    "eval --data root/sequences": "root/sequences .*give the folder that holds",
     "eval --data clouds/0.pcd": "0.pcd .*docs/your-data.md",
     "eval --data five": r"five/0.bin.*nuScenes.*reshape\(-1, 5\)", "metrics root x": "x: .*give",
     "eval --data root --sequences ../sequences/00": "../sequences/00.*choose",
