@@ -3,10 +3,10 @@
 The network takes two consecutive LiDAR scans P and Q and predicts the rigid motion between them.
 Read this file beside the paper, from top to bottom:
 
-    1  Table 1 and the settings            5  Odometry: eq. 1
-    2  Sampling and grouping: 3.3.2, 3.3.3 6  Our additions: augmentation and refinement
-    3  The network: 3.3, eqs. 3 and 4      7  Evaluation: section 5
-    4  Training: eq. 2, section 4          8  The commands train and eval
+    1  Table 1 and the settings               5  Odometry: eq. 1
+    2  Sampling and grouping: 3.3.2, 3.3.3    6  Our additions: augmentation and refinement
+    3  The network: 3.3, eqs. 3 and 4         7  Evaluation: section 5
+    4  Training: eq. 2, section 4             8  The commands train and eval
 
 kitti.py loads or simulates the data, removes the ground plane (section 4) and converts motions to
 the vectors of section 3.2. metrics.py computes E_t and E_r, eqs. 6 to 8. What the paper tried and
@@ -22,7 +22,7 @@ C scans in a batch, B pairs of them; n1 to n3 and k1 to k3 are n_fps and n_n of 
 """
 import os
 
-# PyTorch reads this when it is loaded: idle threads sleep. Spinning ones slow down a busy machine.
+# Set before PyTorch is loaded, so that its idle threads sleep. Spinning ones slow a busy machine.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import argparse
@@ -91,7 +91,7 @@ class Config:
 
     # Training, section 4
     epochs: int = 500
-    batch: int = 16  # pairs of scans in a batch, or a few more; the paper does not say
+    batch: int = 16  # pairs of scans in a batch; those left over join the others
     optimizer: str = "adam"  # the paper's; or ours, "muon": Muon for the hidden layers
     lr: float = 1e-3  # learning rate: Adam's default; with "one-cycle" the peak
     schedule: str = "steps"  # lr / 10 (factor ours) after 3/5 and 4/5 of the steps; or "one-cycle"
@@ -103,8 +103,8 @@ class Config:
     def __post_init__(self):
         # JSON turns a Layer into a list. Turn it back; an immutable class needs object.__setattr__.
         for name in ("sa1", "fe", "sa2", "sa3", "mpn", "mlp"):
-            *numbers, widths = getattr(self, name)
-            object.__setattr__(self, name, Layer(*numbers, tuple(widths)))
+            *rest, widths = getattr(self, name)
+            object.__setattr__(self, name, Layer(*rest, tuple(widths)))
         check_config(self)
 
     def as_dict(self):
@@ -117,8 +117,8 @@ def require(name, values, low, high):
     kind = numbers.Integral if isinstance(low, int) else numbers.Real
     for x in values:
         if isinstance(x, bool) or not isinstance(x, kind) or not low <= x <= high:
-            which = "an integer from " if kind is numbers.Integral else ""
-            raise ValueError(f"{name} is {x!r}, but must be {which}{low} to {high}")
+            what = "an integer" if kind is numbers.Integral else "a number"
+            raise ValueError(f"{name} is {x!r}, but must be {what} from {low} to {high}")
 
 
 def check_config(config):
@@ -230,16 +230,16 @@ def scan_records(scan: np.ndarray, config: Config = Config(), n: int = 1) -> np.
 
     scan: x, y, z [m] in the Velodyne frame, and intensity 0 to 1. Nothing is learned here, so a
     record is computed once for every scan and kept. Refinement uses n > 1: record k takes its
-    centroids from points k, k + n, k + 2n ..., so no two records share one. With fewer than n n1
-    points there are fewer different records. Raises ValueError if too few points are usable.
+    centroids from every n-th point, starting with point k, so no two records share one. With fewer
+    than n * n1 points, some records are equal. Raises ValueError if too few points are usable.
     """
     scan, invalid = kitti.usable_points(scan, config.max_range, config.plane)
     sa1, sa2, sa3 = config.sa1, config.sa2, config.sa3
 
-    def require_enough(points):
-        if points < sa1.n_fps:
+    def require_enough(count):
+        if count < sa1.n_fps:
             reach = config.max_range or kitti.MAX_VALID_RANGE
-            raise ValueError(f"{points} different usable points (finite, within {reach:.0f} m"
+            raise ValueError(f"{count} different usable points (finite, within {reach:.0f} m"
                              f"{'' if config.plane else ', off the ground'}), but the network "
                              f"needs {sa1.n_fps}; are the coordinates in metres?")
 
@@ -291,7 +291,7 @@ def neighbours_in_q(xyz, p, q, k):
     if xyz.device.type == "cpu":
         xyz = xyz.numpy()
         return torch.from_numpy(np.stack([group_knn(xyz[j], xyz[i], k) for i, j in zip(p, q)]))
-    # Elsewhere by a matrix of all distances, to avoid waiting for the CPU. (The mode of cdist that
+    # On a GPU, a matrix of all distances avoids waiting for the CPU. (The mode of cdist that
     # multiplies matrices is too inaccurate.)
     distances = torch.cdist(xyz[p], xyz[q], compute_mode="donot_use_mm_for_euclid_dist")
     idx = distances.topk(min(k, xyz.shape[1]), largest=False).indices  # nearest first
@@ -323,17 +323,18 @@ class MiniPointNet(nn.Module):
         return self.after_first_layer(self.h[0](f))
 
     def over_neighbours(self, a, b, idx):
-        """max h(a_i + b_j) over the neighbours i of each j, given by idx (B,S,k).
+        """max h(a_m + b_s) over the neighbours m of each s, given by idx (B,S,k).
 
         a (B,n,c), b (B,S,c) -> (B,S,c'). The trick: h's first layer is linear, so
-        W (a_i + b_j) + w = W a_i + (W b_j + w). It is applied to n and S rows before the neighbours
-        are gathered, not to S k rows after that.
+        W (a_m + b_s) + w = W a_m + (W b_s + w). So it is applied to n + S rows before the
+        neighbours are gathered, instead of to S k rows after that.
         """
         u = F.linear(a, self.h[0].weight)  # (B,n,c1)
         v = self.h[0](b)  # (B,S,c1)
+        # The neighbours' rows in the flattened batch
         rows = idx + a.shape[1] * torch.arange(len(a), device=a.device)[:, None, None]
-        u_i = u.flatten(0, 1).index_select(0, rows.flatten()).view(*idx.shape, -1)  # (B,S,k,c1)
-        return self.after_first_layer(u_i.add_(v[:, :, None]))
+        u_m = u.flatten(0, 1).index_select(0, rows.flatten()).view(*idx.shape, -1)  # (B,S,k,c1)
+        return self.after_first_layer(u_m.add_(v[:, :, None]))
 
     def after_first_layer(self, z):
         """The output z (...,k,c1) of h's first layer -> its other layers, maximum (...,c')."""

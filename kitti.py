@@ -881,7 +881,8 @@ X, Y, YAW, HALF_X, HALF_Y, Z0, Z1, ALBEDO, FUZZ, ROUND = range(10)
 CITY = 4  # version; increase it when the city changes, so that scans of two versions never mix
 LANE = 3.5  # width of a lane
 SIDE_STREET = 70.0  # how far a side street goes on both sides of the road
-SENSOR_HEIGHT, MIN_RANGE, CITY_RANGE = 1.73, 2.5, 80.0
+SENSOR_HEIGHT, SENSOR_AHEAD = 1.73, 0.8  # above the road; ahead of the rear axle
+MIN_RANGE, CITY_RANGE = 2.5, 80.0
 
 
 class _Style(NamedTuple):
@@ -890,7 +891,7 @@ class _Style(NamedTuple):
     cruise: float  # cruising speed [m/s]
     halts: int  # number of halts per 150 scans, in a queue at a light
     lanes: int  # number of lanes in each direction
-    reservation: float  # width of the central reservation; only motorways have one
+    reservation: float  # width of the central reservation; with one, there are no side streets
     junctions: tuple  # odds of no junction, a street corner, a ramp and a roundabout
     surroundings: tuple  # odds of dense, suburban and open ones
 
@@ -911,7 +912,7 @@ STYLES = {
 
 
 def _pieces_of_road(rng, style):
-    """Draw a straight piece, a bend and a junction: a list of (length, curvature, speed)."""
+    """Draw a straight, a bend and a junction, a list of pieces (length, curvature, speed)."""
     stretch = rng.uniform(35, 80) * max(style.cruise / 15, 1) ** 2
     speed, side = style.cruise * rng.uniform(0.8, 1.0), rng.choice([-1, 1])
     lateral = rng.choice([0.0, rng.uniform(1.0, 2.8)])  # acceleration in the bend, if it is one
@@ -920,16 +921,18 @@ def _pieces_of_road(rng, style):
     arc = min(rng.uniform(0.5, 0.8) * stretch, np.radians(60) / max(abs(bend), 1e-6))
 
     # Turns at the junction: radius, and angle [degrees], positive to the left. A roundabout is
-    # entered to the right, driven for a quarter or a half of it, and left to the right.
+    # entered with a right turn, followed for a quarter or half of its circle, and exited with a
+    # right turn.
     kind = rng.choice(4, p=np.array(style.junctions) / sum(style.junctions))
     corner = rng.uniform(7, 12) + LANE * (style.lanes - 1), side * rng.uniform(70, 100)
     ramp = rng.uniform(25, 32), side * rng.uniform(60, 150)
     radius = rng.uniform(19, 25)
     roundabout = [(radius, -45), (radius, rng.choice([90, 180])), (radius, -45)]
     turns = ([], [corner], [ramp], roundabout)[kind]
-    return [(stretch - arc, 0.0, speed), (arc, bend, speed)] + [
-        (radius * np.radians(abs(angle)), np.sign(angle) / radius, speed)
-        for radius, angle in turns]
+    pieces = [(stretch - arc, 0.0, speed), (arc, bend, speed)]
+    for radius, angle in turns:
+        pieces.append((radius * np.radians(abs(angle)), np.sign(angle) / radius, speed))
+    return pieces
 
 
 class _Drive:
@@ -968,11 +971,12 @@ class _Drive:
             v = v[::-1]
 
         # The time at every place; two times where we stand still
-        t = np.r_[0, np.cumsum(step / smooth(v, 1.0))[:-1]]
+        t, driven = np.r_[0, np.cumsum(step / smooth(v, 1.0))[:-1]], s
         for halt in self.halts:
-            i = np.searchsorted(s, halt)
-            t, s = np.r_[t[:i + 1], t[i:] + rng.uniform(1, 4)], np.insert(s, i, s[i])
-        self.t, self.driven = t - t[np.searchsorted(s, start)], s
+            i = np.searchsorted(driven, halt)
+            t = np.r_[t[:i + 1], t[i:] + rng.uniform(1, 4)]
+            driven = np.insert(driven, i, driven[i])
+        self.t, self.driven = t - t[np.searchsorted(driven, start)], driven
 
     def position(self, at, left=0.0):
         """x, y and heading at the places `at`, `left` metres to the left of our path."""
@@ -985,7 +989,10 @@ class _Drive:
         return np.interp(t, self.t, self.driven)
 
     def is_measurable(self, scans):
-        """Whether we come far enough for segments of 100 m, and turn enough to measure rotation."""
+        """Whether we come far (119 m in 170 scans), and turn enough, to the left and to the right.
+
+        Otherwise E_t has no segment, or standing still has hardly an error in rotation.
+        """
         s = self.distance(np.arange(scans + 1) * 0.1)
         turn = np.degrees(np.diff(self.position(s)[2]))  # from each scan to the next
         return (s[-1] - s[0] > 0.7 * min(scans, 170) and turn.std() > 0.85
@@ -1007,14 +1014,16 @@ def _sensor_poses(rng, drive, t):
     turn = drive.position(after)[2] - drive.position(before)[2]
     lateral = speed * turn / 0.4  # acceleration [m/s2]
     shake = np.minimum(speed / 8, 1)  # a car at rest does not shake
+    # In degrees
     roll = 0.25 * lateral + shake * (wave(0.25, 0.2, 0.8) + wave(0.12, 1, 2.5))
     pitch = shake * (wave(0.25, 0.2, 0.8) + wave(0.14, 1, 2.5))
     pitch -= 0.2 * gaussian_filter(acceleration, 2)
     z = SENSOR_HEIGHT + shake * wave(0.015, 0.3, 1.5)
-    # The rear axle follows the road. The Velodyne is 0.8 m ahead of it, so turns move it sideways.
+    # The rear axle follows the road. The Velodyne is ahead of it, so turns also move it sideways.
     x, y, yaw = drive.position(s)
     R = Rotation.from_euler("xyz", np.stack([np.radians(roll), np.radians(pitch), yaw], axis=1))
-    return rigid(R.as_matrix(), np.stack([x + 0.8 * np.cos(yaw), y + 0.8 * np.sin(yaw), z], axis=1))
+    x, y = x + SENSOR_AHEAD * np.cos(yaw), y + SENSOR_AHEAD * np.sin(yaw)
+    return rigid(R.as_matrix(), np.stack([x, y, z], axis=1))
 
 
 def _hills(rng, T):
@@ -1087,7 +1096,7 @@ class _Street:
     """
 
     def __init__(self, rng, drive, side, edge, zones):
-        self.rng, self.drive, self.length, self.prisms = rng, drive, drive.length, []
+        self.rng, self.drive, self.prisms = rng, drive, []
         self.side, self.edge, self.zones = side, edge, zones
 
     def put(self, s, out, half_x, half_y, z1, albedo, fuzz=0, twist=0, z0=0):
@@ -1106,22 +1115,22 @@ class _Street:
     def plots(self):
         """Houses and gardens, one plot after the other."""
         rng, u, s = self.rng, self.rng.uniform, 0.0
-        while s < self.length:
-            kind = self.zones[int(s / 70)]
-            plot, setback = u(9, (22, 16, 16)[kind]), u(*((3.5, 7), (6, 14), (8, 30))[kind])
-            middle = s + plot / 2
-            if rng.random() < (0.95, 0.8, 0.3)[kind]:
+        while s < self.drive.length:
+            zone = self.zones[int(s / 70)]
+            plot = u(9, (22, 16, 16)[zone])  # its length along the road
+            setback, middle = u((3.5, 6, 8)[zone], (7, 14, 30)[zone]), s + plot / 2
+            if rng.random() < (0.95, 0.8, 0.3)[zone]:
                 self.house(middle, setback, plot)
-            if kind > 0 and rng.random() < 0.65:  # a hedge, or a wall or fence
+            if zone > 0 and rng.random() < 0.65:  # a hedge, or a wall or fence
                 thick, fuzz = (0.35, 0.25) if rng.random() < 0.6 else (0.1, 0)
                 self.put(middle, u(2.2, 3.2), plot * u(0.3, 0.48), thick, u(0.6, 1.9), u(0.2, 0.4),
                          fuzz)
-            for _ in range(rng.poisson((1, 3, 3)[kind])):  # a tree and a bush
+            for _ in range(rng.poisson((1, 3, 3)[zone])):  # each time a tree and a bush
                 self.tree(s + u(0, 1) * plot, u(3, setback + 3))
                 self.put(s + u(0, 1) * plot, u(3, 7), u(0.4, 1.2), None, u(0.5, 1.8), u(0.2, 0.4),
                          0.25)
             # A gap to the next plot, wide or narrow
-            s += plot + (u(5, 14) if kind > 0 or rng.random() < 0.35 else u(0, 1))
+            s += plot + (u(5, 14) if zone > 0 or rng.random() < 0.35 else u(0, 1))
 
     def house(self, s, setback, plot):
         """A house with bays, stairs and porches, without which all of a facade looks the same."""
@@ -1136,7 +1145,7 @@ class _Street:
     def pavement(self):
         """Trees, poles of lamps and signs, and boxes."""
         u, s = self.rng.uniform, 0.0
-        while s < self.length:
+        while s < self.drive.length:
             choice = u(0, 1)
             if choice < 0.35:
                 self.tree(s, u(2.2, 3))
@@ -1149,8 +1158,8 @@ class _Street:
     def background(self):
         """Houses, trees and thickets up to 65 m away, seen between the plots."""
         rng, u = self.rng, self.rng.uniform
-        for _ in range(int(self.length / 4)):
-            s, out, choice = u(0, self.length), u(6, 65), rng.random()
+        for _ in range(int(self.drive.length / 4)):
+            s, out, choice = u(0, self.drive.length), u(6, 65), rng.random()
             if choice < 0.3:
                 self.put(s, out, u(4, 12), u(4, 8), u(4, 12), u(0.2, 0.4), 0, rng.normal() * 0.3)
             elif choice < 0.6:
@@ -1162,12 +1171,17 @@ class _Street:
     def parked_cars(self):
         """Cars along the edge of the road."""
         rng, s = self.rng, 0.0
-        while s < self.length:
+        while s < self.drive.length:
             car = _vehicles(rng, 1, PARKED)
             if rng.random() < (0.7, 0.5, 0.1)[self.zones[int(s / 70)]]:
                 x, y, yaw = self.drive.position(s, self.side * (self.edge + rng.uniform(1.2, 1.5)))
                 self.prisms.append(_place(car, x, y, yaw + rng.normal() * 0.03))
             s += 2 * car[0, 0, HALF_X] + rng.uniform(0.6, 3)
+
+    def barrier(self, out):
+        """A crash barrier `out` metres beyond the edge of the road."""
+        for s in np.arange(0, self.drive.length, 4.0):
+            self.put(s, out, 2.0, 0.1, 0.8, 0.4, z0=0.4)
 
 
 def _roadside(rng, drive, lanes, style):
@@ -1176,16 +1190,16 @@ def _roadside(rng, drive, lanes, style):
     zones = rng.choice(3, p=odds / sum(odds), size=(2, int(drive.length / 70) + 1))
     left = _Street(rng, drive, 1, lanes[1].max() + LANE / 2, zones[0])
     right = _Street(rng, drive, -1, LANE / 2 - lanes[0].min(), zones[1])
-    rails = (left, 1.5), (right, 1.5), (left, -len(lanes[1]) * LANE - style.reservation / 2)
     for street in left, right:
         street.plots()
         street.pavement()
         street.background()
-        if not style.reservation:
+        if style.reservation:
+            street.barrier(1.5)
+        else:
             street.parked_cars()
-    for street, out in rails[:3 * bool(style.reservation)]:
-        for s in np.arange(0, drive.length, 4.0):
-            street.put(s, out, 2.0, 0.1, 0.8, 0.4, z0=0.4)
+    if style.reservation:  # in its middle
+        left.barrier(-len(lanes[1]) * LANE - style.reservation / 2)
     return np.concatenate(left.prisms + right.prisms)
 
 
@@ -1217,8 +1231,8 @@ def _ground(rng, drive, lanes, side_streets):
     return height.astype(f4), albedo.astype(f4), corner
 
 
-def _is_off_road(prisms, ground):
-    """Which prisms (n,10) are off the road or, like crowns, higher than a car -> (n,) bool."""
+def _leaves_road_clear(prisms, ground):
+    """Which prisms (n,10) are off the road or, like crowns, begin 2.2 m above it -> (n,) bool."""
     height, _, corner = ground
     x, y, yaw, half_x, half_y = prisms[:, [X, Y, YAW, HALF_X, HALF_Y]].T[:, :, None, None]
     along, across = half_x * np.linspace(-1, 1, 9)[:, None], half_y * np.linspace(-1, 1, 9)
@@ -1241,8 +1255,9 @@ def _lane_with_us(rng, drive, t, left):
     own = drive.distance(t)
     driven = own[-1] - own[0]
     rate = 1 + np.sign(left) * rng.choice([0.02, rng.uniform(0.05, 0.3)])
-    # Twice as many as are ever seen at our mean speed
-    n = 1 + int((360 + 4 * abs(rate - 1) * driven) / (8 + 1.3 * driven / len(t) / 0.1))
+    # Twice as many as are ever seen, 90 m ahead and behind, at our mean speed
+    spacing = 8 + 1.3 * driven / len(t) / 0.1
+    n = 1 + int((360 + 4 * abs(rate - 1) * driven) / spacing)
     vehicles = _vehicles(rng, n, MOVING)
     half = vehicles[0, :, HALF_X, None]  # of the length (n,1)
     offset = np.cumsum(2 * half + rng.uniform(2, 5, (n, 1)), axis=0) - half
@@ -1252,33 +1267,40 @@ def _lane_with_us(rng, drive, t, left):
     wave, phase = rng.uniform(0.2, 0.6, (n, 1)), rng.uniform(0, 6.3, (n, 1))
     lead = lead + 0.25 * np.sin(wave * t + phase)  # (n,scans); distances are never quite constant
     s = own[0] + offset + rate * (drive.distance(t + lead) - own[0])
-    # Those ahead of us in our lane stand on this side of the light, so the side street stays free
+    # In our own lane, keep only those less than 25 m ahead. At a halt they stand on this side of
+    # the light, so the side street stays free.
     free = (offset + half < 25)[:, 0] | (left != 0)
     return vehicles[:, free], s[free]
 
 
 def _traffic(rng, drive, t, lanes, side_streets, style):
     """Draw all vehicles on the road at times t (scans,): moving(i) -> prisms (m,10) at scan i."""
-    # Groups of vehicles: prisms (2,n,10), places along the road, metres to the left of our path,
-    # angle to the road. The first is our own car; the sensor is 0.8 m ahead of its rear axle.
-    own = drive.distance(t)
+    groups = []
+
+    def add(vehicles, s, left, turn):
+        """Add n vehicles: prisms (2,n,10), places s (n,scans) along the road, metres to the left of
+        our path, angle to the road."""
+        groups.append((vehicles, np.broadcast_arrays(s, left, turn)))
+
+    # Our own car comes first, so that others make way for it. Its middle is below the sensor.
+    own = drive.distance(t)  # of our rear axle
     car = _prisms(0, 0, 0, 2.5, 1.0, 0, 2, 0, 0, 0)[None].repeat(2, axis=0)
-    groups = [(car, own + 0.8, 0, 0)]
-    groups += [(*_lane_with_us(rng, drive, t, left), left, 0) for left in lanes[0]]
+    add(car, own[None] + SENSOR_AHEAD, 0, 0)
+    for left in lanes[0]:
+        add(*_lane_with_us(rng, drive, t, left), left, 0)
     for left in lanes[1]:  # towards us, at the speed of their lane
         speed = style.cruise * rng.uniform(0.6, 1.0)
         n = int((drive.length + speed * t[-1]) / 40)
         start = np.cumsum(rng.uniform(20, 60, (n, 1)), axis=0)
-        groups.append((_vehicles(rng, n, MOVING), start - speed * t, left, np.pi))
+        add(_vehicles(rng, n, MOVING), start - speed * t, left, np.pi)
     for street in side_streets:  # across, at about the time when we are there
         side, speed = rng.choice([-1, 1], (8, 1)), rng.uniform(4, 12, (8, 1))
         our_time = t[np.searchsorted(own, street - 20).clip(0, len(t) - 1)]
         left = side * speed * (t - our_time - rng.uniform(-8, 8, (8, 1)))
-        groups.append((_vehicles(rng, 8, MOVING), street + side * LANE / 2, left, side * np.pi / 2))
+        add(_vehicles(rng, 8, MOVING), street + side * LANE / 2, left, side * np.pi / 2)
 
-    vehicles = np.concatenate([group[0] for group in groups], axis=1)  # (2,n,10)
-    s, left, turn = (np.concatenate([np.broadcast_to(group[k], (group[0].shape[1], len(t)))
-                                     for group in groups]) for k in (1, 2, 3))  # (n,scans) each
+    vehicles = np.concatenate([vehicles for vehicles, _ in groups], axis=1)  # (2,n,10)
+    s, left, turn = np.concatenate([motion for _, motion in groups], axis=1)  # (n,scans) each
     x, y, yaw = drive.position(s, left)
     yaw = yaw + turn
     seen = (np.hypot(x - x[0], y - y[0]) < CITY_RANGE + 10) & (np.abs(left) < SIDE_STREET)
@@ -1294,7 +1316,7 @@ def _traffic(rng, drive, t, lanes, side_streets, style):
 
 
 def _remove_collisions(x, y, yaw, seen, vehicles):
-    """Remove vehicles that ever run into one before them in the list: set seen (n,scans) False.
+    """Set seen (n,scans) to False for each vehicle that ever overlaps one earlier in the list.
 
     Vehicles are approximated by five discs in a row.
     """
@@ -1311,7 +1333,7 @@ def _remove_collisions(x, y, yaw, seen, vehicles):
 
 
 class _World:
-    """All of a sequence but the sensor.
+    """The world of a sequence: where the sensor goes, and what it can see.
 
     T, T_flat (scans,4,4): poses T_wt of the Velodyne, on the hills and before they were added;
     prisms (n,10): what stands still; moving(i) -> prisms (m,10) of the vehicles at scan i; ground:
@@ -1331,13 +1353,14 @@ class _World:
         # Lanes in our direction, and in the other: metres to the left of our path. Our own is at 0.
         ours = (np.arange(style.lanes) - rng.integers(style.lanes)) * LANE
         lanes = ours, ours.max() + style.reservation + LANE * np.arange(1, style.lanes + 1)
-        # Side streets: at the light ahead of every halt and elsewhere, where the road is straight
+        # Side streets: 30 m ahead of every halt, where the light is, and elsewhere; only where the
+        # road is straight
         at = np.r_[drive.halts + 30, rng.uniform(0, drive.length, int(drive.length / 120))]
         turn = drive.position(at + 8)[2] - drive.position(at - 8)[2]
         side_streets = at[(np.abs(turn) < 0.1) & (style.reservation == 0)]
         self.ground = _ground(rng, drive, lanes, side_streets)
         prisms = _roadside(rng, drive, lanes, style)
-        self.prisms = prisms[_is_off_road(prisms, self.ground)]
+        self.prisms = prisms[_leaves_road_clear(prisms, self.ground)]
         self.moving = _traffic(rng, drive, t, lanes, side_streets, style)
         self.height, self.T = _hills(rng, self.T_flat)
 
@@ -1399,6 +1422,7 @@ def _crossings(p, eye, rays):
     wide = (np.arctan2(to_y, to_x) - centre + np.pi) % (2 * np.pi) - np.pi
     first = np.ceil((centre + wide.min(axis=0) - rays.a0) / rays.step).astype(int)
     last = np.floor((centre + wide.max(axis=0) - rays.a0) / rays.step).astype(int)
+    # From inside a prism, seen from above, all columns would cross it; it is left out
     inside = (np.abs(x) < half_x + 0.3) & (np.abs(y) < half_y + 0.3)
     k, col = _expand_ranges(first, np.where(inside, 0, last - first + 1))
     col %= len(rays.cos_a)
@@ -1409,9 +1433,10 @@ def _crossings(p, eye, rays):
     with np.errstate(divide="ignore", invalid="ignore"):
         per_x, per_y = 1 / (c * ca + s * sa), 1 / (c * sa - s * ca)  # way along the ray for 1 m
         slab_x, slab_y = half_x * np.abs(per_x), half_y * np.abs(per_y)
-        enter_x, enter_y = -x * per_x - slab_x, -y * per_y - slab_y
-        box = (np.maximum(enter_x, enter_y), np.minimum(-x * per_x + slab_x, -y * per_y + slab_y),
-               1 / np.abs(np.where(enter_x > enter_y, per_x, per_y)))
+        enter_x, leave_x = -x * per_x - slab_x, -x * per_x + slab_x
+        enter_y, leave_y = -y * per_y - slab_y, -y * per_y + slab_y
+        cosine = 1 / np.abs(np.where(enter_x > enter_y, per_x, per_y))
+        box = np.maximum(enter_x, enter_y), np.minimum(leave_x, leave_y), cosine
         middle = dx * ca + dy * sa  # the point nearest to the cylinder's axis
         half_chord = np.sqrt(np.maximum(half_x**2 - (dx * sa - dy * ca) ** 2, 0))
         cylinder = middle - half_chord, middle + half_chord, half_chord / half_x
@@ -1432,7 +1457,8 @@ def _hit_prisms(p, eye, rays, rng):
     z0, z1, albedo, fuzz = np.float32([p[:, Z0] - h, p[:, Z1] - h, p[:, ALBEDO], p[:, FUZZ]])[:, k]
 
     # Nothing is seen behind a solid prism that stops every beam of its column
-    full = (z0 <= 0.01 - h) & (z1 > enter * rays.slope[col]) & (fuzz == 0)  # of the top beam
+    # (the first slopes are those of the top beam)
+    full = (z0 <= 0.01 - h) & (z1 > enter * rays.slope[col]) & (fuzz == 0)
     wall = np.full(len(rays.cos_a), CITY_RANGE, np.float32)  # (A,) distance to such a prism
     np.minimum.at(wall, col[full], enter[full])
     seen = enter <= wall[col]
@@ -1451,15 +1477,16 @@ def _hit_prisms(p, eye, rays, rng):
     # A ray hits the face of the prism or, above or below it, its top or its bottom
     slope = rays.slope[ray]
     above, below = slope * enter[g] > z1[g] + 1e-3, slope * enter[g] < z0[g] - 1e-3
+    on_level = above | below
     with np.errstate(divide="ignore", invalid="ignore"):
-        reach = np.where(above | below, np.where(above, z1[g], z0[g]) / slope, enter[g])
+        reach = np.where(on_level, np.where(above, z1[g], z0[g]) / slope, enter[g])
 
     # Keep the nearest hit of each ray
     hits = np.zeros((4, len(rays.slope)), np.float32)
     hits[0] = np.inf
     np.minimum.at(hits[0], ray, reach)
     best = reach <= hits[0, ray]
-    ray, g, on_level = ray[best], g[best], (above | below)[best]
+    ray, g, on_level = ray[best], g[best], on_level[best]
     relief = np.where(fuzz > 0, fuzz, np.where(z1 - z0 > 3, RELIEF, 0))
     cosine = np.where(on_level, np.abs(rays.sin_w[ray]), facing[g] * rays.cos_w[ray])
     hits[1:, ray] = cosine, albedo[g], relief[g]
@@ -1469,7 +1496,7 @@ def _hit_prisms(p, eye, rays, rng):
 def _hit_ground(hits, ground, eye, rays):
     """Add to the `hits` of `_hit_prisms` the ground, for rays that have hit nothing so far.
 
-    The lowest beams hit the bonnet or the boot of our own car instead, and return nothing.
+    Where the bonnet or the boot of our own car hides the ground, the beam returns nothing.
     """
     (height, albedo, corner), azimuth, h = ground, len(rays.cos_a), np.float32(eye[2])
     off_axis = np.abs((rays.step * np.arange(azimuth) + np.pi) % (2 * np.pi) - np.pi)
@@ -1498,8 +1525,8 @@ def _returns(hits, eye, rays, rng):
     ray = np.flatnonzero(hits[0] < CITY_RANGE)  # (M,)
     col = ray % len(rays.cos_a)
     d, cosine, albedo, depth = hits[:, ray]
-    noise, uniform = (functools.partial(draw, len(ray), np.float32)
-                      for draw in (rng.standard_normal, rng.random))
+    noise = functools.partial(rng.standard_normal, len(ray), np.float32)
+    uniform = functools.partial(rng.random, len(ray), np.float32)
 
     # Range. Light gets into foliage, or into the windows and doors of a facade, by a depth that is
     # random for each cell of 0.6 m but the same in every scan.
@@ -1512,7 +1539,7 @@ def _returns(hits, eye, rays, rng):
     # Intensity. From 60 m on, KITTI's intensities are mostly 0; elsewhere 8 % are.
     light = albedo * (0.65 + 0.4 * np.sqrt(cosine)) + 0.08 * noise() - 0.01 * np.maximum(r - 25, 0)
     light = np.where(uniform() > 0.08, light, 0)
-    # Lost returns: far and dark, grazing, or very dark
+    # Lost returns: one in a hundred, and those far and dark, grazing, or very dark
     far = 0.10 * (r / 40) ** 2 * (0.15 / (0.05 + albedo))
     lost = 0.01 + far + 0.3 * np.exp(-cosine / 0.02) + 0.5 * np.exp(-albedo / 0.03)
     returned = (uniform() > lost) & (r < CITY_RANGE) & (r > MIN_RANGE)
@@ -1564,7 +1591,10 @@ def _save_scan(task):
 
 
 def _is_complete(root, name, settings):
-    """Whether ROOT holds this sequence, simulated with these settings. ValueError for any other."""
+    """Whether ROOT holds this sequence, simulated with these settings.
+
+    Raises ValueError if it holds another one of this name.
+    """
     folder, truth = root / "sequences" / name, root / "poses" / f"{name}.txt"
     if not (folder.exists() or truth.exists()):
         return False
@@ -1617,7 +1647,8 @@ def simulate(root: str | Path, seed=0, sequences="all", scans=None, azimuth=1800
     default = dict.fromkeys(SPLITS["test"] + SPLITS["validation"], 170)
     settings = {name: dict(city=CITY, seed=int(seed), scans=int(scans or default.get(name, 320)),
                            azimuth=int(azimuth)) for name in names}
-    for name in [name for name in names if not _is_complete(root, name, settings[name])]:
+    missing = [name for name in names if not _is_complete(root, name, settings[name])]
+    for name in missing:
         try:
             _simulate_sequence(root, name, settings[name], workers or cores())
         except OSError:
