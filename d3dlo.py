@@ -547,7 +547,7 @@ def fit(net, data, run, test=(), seed=0, device="cpu", objective=None, checkpoin
     facts: values to store with the weights: all that `training_facts` returns.
 
     RUN/checkpoint.pt holds all that a step changes, and a batch depends on the seed and its number
-    alone. So on the same machine and with as many threads, a resumed run ends with the same
+    alone. So on the same CPU and with as many threads, a resumed run ends with the same
     weights, bit for bit. Raises ValueError if the loss, a weight or a statistic is not finite;
     nothing is stored from then on.
     """
@@ -580,8 +580,8 @@ def fit(net, data, run, test=(), seed=0, device="cpu", objective=None, checkpoin
     def require_finite(x, name):
         if not math.isfinite(x):
             raise ValueError(f"{run}: {name} became non-finite at step {step} (learning rate "
-                             f"{rate:.1e}); the last checkpoint, if any, was kept. Try a lower "
-                             "learning rate")
+                             f"{rate:.1e}); the last checkpoint, if any, was kept. Start anew "
+                             "with a lower learning rate")
 
     def store(name, net, **content):
         tensors = [*net.state_dict().values(), *objective.parameters()]

@@ -9,7 +9,7 @@ The first half holds what the paper tried and rejected, as losses and as subclas
 are passed to `d3dlo.train` as its `objective` and its `network`.
 
 A pair-step is one pair of scans, in one direction, in one training step. All runs of a table have
-the same number of pair-steps, the same batch size, the same data and, for the same seed, the same
+the same number of pair-steps, in all and in a batch, the same data and, for the same seed, the same
 order of pairs. The recipe is the short one, d3dlo.SHORT.
 
 Every run has a folder in OUT, named by a hash of everything it depends on. Finished runs are not
@@ -330,17 +330,18 @@ def evaluations(run, root, sequences, real):
     return every
 
 
-def execute(run, root, trained, every):
+def execute(run, root, trained, every, device):
     """Start or resume a training run, then make those of its evaluations that are missing."""
     variant = EXPERIMENTS[run.experiment][run.variant]
     if not run.results("all"):
         d3dlo.ALIGNED = variant.aligned
         d3dlo.train(run.config, root, trained, run.folder, run.seed, network=variant.network,
-                    objective=variant.objective(), resume=(run.folder / "config.json").exists())
+                    objective=variant.objective(), device=device,
+                    resume=(run.folder / "config.json").exists())
     for name, (data, sequences, refine) in every.items():
         if not run.results(name):
             shutil.rmtree(run.folder / name, ignore_errors=True)  # of an interrupted evaluation
-            d3dlo.evaluate(data, run.folder, sequences, run.folder / name, refine=refine,
+            d3dlo.evaluate(data, run.folder, sequences, run.folder / name, device, refine,
                            network=variant.network, say=lambda text: None)
 
 
@@ -433,6 +434,7 @@ def command_line():
     add("--seeds", nargs="+", type=int, default=[0, 1], metavar="N", help="default: 0 1")
     add("--out", type=Path, default=Path("runs/experiments"), metavar="OUT",
         help="folder of the runs and of NAME.json, the figures (default: runs/experiments)")
+    add("--device", default="cpu", help="cpu, cuda or mps (default: cpu)")
     add("--real", metavar="ROOT", help="real scans, to score the ablation on")
     add("--dry-run", action="store_true", help="list the runs and the size of their caches")
     return parser.parse_args()
@@ -465,7 +467,7 @@ def main():
     for run in todo:
         print(f"{run.experiment}: {run.variant}, seed {run.seed} -> {run.folder}", flush=True)
         if not args.dry_run:
-            execute(run, root, trained, wanted[run.folder])
+            execute(run, root, trained, wanted[run.folder], args.device)
     if args.dry_run:
         caches = {(run.config.sa1, run.config.plane, run.config.max_range): run.config
                   for run in todo}.values()
