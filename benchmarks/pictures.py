@@ -8,13 +8,8 @@
 Trajectories and errors come from two evaluations of the same data, plain and refined:
 
     python d3dlo.py eval --data ROOT --out P && python d3dlo.py eval --data ROOT --refine 3 --out R
-    python benchmarks/pictures.py paths docs/paths.png ROOT P R --sequences 03 04 06
-    python benchmarks/pictures.py cloud docs/cloud.png ROOT R --sequences 05
-
-The errors of KISS-ICP on the same data come from benchmarks/classical.py:
-
-    python benchmarks/classical.py ROOT K
-    python benchmarks/pictures.py steps docs/steps.png P R K    # real drives
+    python benchmarks/pictures.py paths docs/paths.png ROOT P R --sequences 03 06 10
+    python benchmarks/pictures.py cloud docs/cloud.png ROOT R --sequences 06
 """
 import argparse
 import base64
@@ -34,9 +29,7 @@ import d3dlo
 import kitti
 import metrics
 
-COLOURS = {"truth": "0.6", "plain": "tab:orange", "refined": "tab:blue", "KISS-ICP": "tab:green"}
-# Error of a step [m] that comes from the noise of the ground truth, GPS/IMU; docs/results.md
-TRUTH_NOISE = {"drive0013": 0.015, "drive0005": 0.024}
+COLOURS = {"truth": "0.6", "plain": "tab:orange", "refined": "tab:blue"}
 
 
 def tour(notebook):
@@ -163,29 +156,6 @@ def cloud(root, refined, sequences):
     return figure
 
 
-def steps(plain, refined, classical):
-    """Draw bars: the error per step on the real drives, plain, refined and of KISS-ICP."""
-    folders = {"plain": plain, "refined": refined, "KISS-ICP": classical}
-    results = {label: json.loads((folder / "results.json").read_text(encoding="utf-8"))["sequences"]
-               for label, folder in folders.items()}
-    figure, x = metrics.new_figure(8, 3), np.arange(len(TRUTH_NOISE))
-    centimetres, degrees = figure.subplots(1, 2)
-    for axis, key, unit in (centimetres, "t_step_m", 100), (degrees, "r_step_deg", 1):
-        for i, (label, of_drive) in enumerate(results.items()):
-            heights = [unit * of_drive[name][key] for name in TRUTH_NOISE]
-            axis.bar(x + 0.27 * (i - 1), heights, 0.25, color=COLOURS[label], label=label)
-        axis.set_xticks(x, [name.replace("drive", "real drive ") for name in TRUTH_NOISE])
-        axis.grid(axis="y", color="0.9")
-        axis.set_axisbelow(True)
-    noise = [100 * noise for noise in TRUTH_NOISE.values()]
-    centimetres.hlines(noise, x - 0.42, x + 0.42, "k", "--", lw=1,
-                       label="noise of the ground truth")
-    centimetres.set(ylabel="mean error per step [cm]", ylim=(0, 1.4 * centimetres.get_ylim()[1]))
-    centimetres.legend(frameon=False, fontsize=8, ncols=2)
-    degrees.set_ylabel("mean error per step [deg]")
-    return figure
-
-
 def curve(run):
     """Draw the training loss and the test loss of each epoch, from a run's log."""
     log = (run / "log.txt").read_text(encoding="utf-8")
@@ -233,9 +203,8 @@ def table2(out):
     return figure
 
 
-FOLDERS = {tour: [], network: [], paths: ["root", "plain", "refined"],
-           cloud: ["root", "refined"],
-           steps: ["plain", "refined", "classical"], curve: ["run"], table2: ["out"]}
+FOLDERS = {tour: [], network: [], curve: ["run"], table2: ["out"], cloud: ["root", "refined"],
+           paths: ["root", "plain", "refined"]}
 
 
 def command_line():
