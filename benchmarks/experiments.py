@@ -320,13 +320,14 @@ def plan(experiments, pairs, budget, seeds, out, data):
 def evaluations(run, root, sequences, real):
     """{folder: (data, sequences, refinement passes)} of the evaluations of a Run.
 
-    The rows of the ablation are also refined, and scored on the real scans in the folder `real`.
+    The rows of the ablation are scored on the test split and on the real scans in the folder
+    `real`, plain and refined.
     """
-    every = {"all": (root, sequences, 0)}
-    if run.experiment == "ablation":
-        every["all-refined"] = root, ["test"], 3
-        if real:
-            every |= {"real": (real, ["all"], 0), "real-refined": (real, ["all"], 3)}
+    if run.experiment != "ablation":
+        return {"all": (root, sequences, 0)}
+    every = {"all": (root, ["test"], 0), "all-refined": (root, ["test"], 3)}
+    if real:
+        every |= {"real": (real, ["all"], 0), "real-refined": (real, ["all"], 3)}
     return every
 
 
