@@ -1252,15 +1252,16 @@ def command_line(argv):
     add("--sequences", nargs="+", metavar="NN", help=(
         "names, or splits: train, test, validation, all (default for train: train; for eval: all, "
         "or test and validation of the simulated city)"))
-    add("--weights", metavar="FILE|RUN", type=os.path.expanduser, help=(
-        "a weights file, or the folder of a training run (default for eval: the pretrained "
-        "weights; train starts from these weights and keeps their network and input settings)"))
     add("--device", help="cpu, cuda or mps (default: cpu)")
-    add("--out", metavar="DIR", type=os.path.expanduser, help=(
-        "new folder to write (default: runs/TIME or results/TIME)"))
+    weights = dict(metavar="FILE|RUN", type=os.path.expanduser)
+    out = dict(metavar="DIR", type=os.path.expanduser)
 
     add = commands.add_parser("train", parents=[both], **settings, help=(
         "train, then evaluate on the test and validation splits")).add_argument
+    add("--out", **out, help="new or empty folder for the training run (default: runs/TIME)")
+    add("--weights", **weights, help=(
+        "start from these weights, a file or the folder of a training run, and keep their network "
+        "and input settings"))
     add("--short", action="store_true", help=(
         "our short recipe, the default without --data: few epochs, points within 50 m, both "
         "directions, Muon, one-cycle learning rate, augmentation, fixed BatchNorm statistics at "
@@ -1277,10 +1278,14 @@ def command_line(argv):
     add("--seed", type=int, metavar="N", help=(
         "random seed for initialisation, pair order and augmentation (default: 0)"))
     add("--resume", action="store_true", help=(
-        "continue the training run in --out with the options it was started with"))
+        "continue the training run in --out with the options it was started with; only --device "
+        "may be given, too"))
 
     add = commands.add_parser("eval", parents=[both], **settings, help=(
         "predict trajectories and print KITTI's errors")).add_argument
+    add("--out", **out, help="new or empty folder for the results (default: results/TIME)")
+    add("--weights", **weights, help=(
+        "a weights file, or the folder of a training run (default: the pretrained weights)"))
     add("--refine", type=int, metavar="N", help=(
         "not in the paper: refine each pose in N passes, each with its own sampling of the scan, "
         "the first against a keyframe, the others against the last scan; 3 is recommended "
