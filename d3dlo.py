@@ -326,8 +326,8 @@ class MiniPointNet(nn.Module):
         """max h(a_m + b_s) over the neighbours m of each s, given by idx (B,S,k).
 
         a (B,n,c), b (B,S,c) -> (B,S,c'). The trick: h's first layer is linear, so
-        W (a_m + b_s) + w = W a_m + (W b_s + w). So it is applied to n + S rows before the
-        neighbours are gathered, instead of to S k rows after that.
+        W (a_m + b_s) + w = W a_m + (W b_s + w). This takes n + S rows before the neighbours are
+        gathered, instead of S k rows after that.
         """
         u = F.linear(a, self.h[0].weight)  # (B,n,c1)
         v = self.h[0](b)  # (B,S,c1)

@@ -39,7 +39,7 @@ import kitti
 OLD = hasattr(d3dlo, "scan_geometry")  # commit b9e6db3
 SCANS, EPOCHS, WARM_UP = 33, 6, 2  # 32 pairs in two batches an epoch; epochs not counted
 CONFIG = d3dlo.Config(max_range=50.0, epochs=EPOCHS, batch=16, swap="both", augment=True)
-KITTI_PAIRS = 15960  # pairs of KITTI's training split
+KITTI_PAIRS = 15960  # pairs of the paper's training split of KITTI
 
 # ------------------------------------------------------------------------------------------------
 # Measurements: functions of a `kitti.Sequence` and of a form, which is "here" or a baseline's name.
@@ -161,7 +161,7 @@ def memory(s, form):
     peak = int(re.search(r"VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text())[1])
     cache = (KITTI_PAIRS + 1) * d3dlo.record_dtype(CONFIG).itemsize
     return (f"training: {peak / 2**20:.2f} GiB, and up to {cache / 2**30:.2f} GiB for the pages of "
-            "the cache of KITTI's training split")
+            "the cache of the paper's training split")
 
 
 # ------------------------------------------------------------------------------------------------
