@@ -334,13 +334,17 @@ class MiniPointNet(nn.Module):
         # The neighbours' rows in the flattened batch
         rows = idx + a.shape[1] * torch.arange(len(a), device=a.device)[:, None, None]
         u_m = u.flatten(0, 1).index_select(0, rows.flatten()).view(*idx.shape, -1)  # (B,S,k,c1)
-        return self.after_first_layer(u_m.add_(v[:, :, None]))
+        return self.after_first_layer(u_m + v[:, :, None])
 
     def after_first_layer(self, z):
         """The output z (...,k,c1) of h's first layer -> its other layers, maximum (...,c')."""
+        *sets, k, _ = z.shape
         points = self.h[1:-1](z.flatten(0, -2))  # (points,c'): all points share the MLP
+        # The maximum, by pooling an image with a row per set: amax has a slow backward pass
+        image = points.view(1, -1, k, points.shape[1]).movedim(3, 1)  # (1,c',sets,k)
+        maximum = F.max_pool2d(image, (1, k)).movedim(1, 3)  # (1,sets,1,c')
         # ReLU is non-decreasing, so the last one may come after the maximum
-        return F.relu(points.unflatten(0, z.shape[:-1]).amax(-2))
+        return F.relu(maximum).view(*sets, -1)
 
 
 class SetAbstraction(nn.Module):
