@@ -95,7 +95,6 @@ class Config:
     optimizer: str = "adam"  # the paper's; or ours, "muon": Muon for the hidden layers
     lr: float = 1e-3  # learning rate: Adam's default; with "one-cycle" the peak
     schedule: str = "steps"  # lr / 10 (factor ours) after 3/5 and 4/5 of the steps; or "one-cycle"
-    swap: str = "random"  # the paper's: one direction of each pair; or ours, "both"
     augment: bool = False  # ours: also mirror pairs and move Q by small random motions
     frozen: float = 0.0  # ours: share of the steps, at the end, with fixed BatchNorm statistics;
     # the weights are still trained
@@ -140,7 +139,7 @@ def check_config(config):
     require("frozen", [config.frozen], 0.0, 0.999)
     if config.mlp.widths[-1] != 6:
         raise ValueError("the last width of mlp must be 6: translation and angles")
-    for name, choices in dict(plane=(True, False), augment=(True, False), swap=("random", "both"),
+    for name, choices in dict(plane=(True, False), augment=(True, False),
                               optimizer=("adam", "muon"), schedule=("steps", "one-cycle")).items():
         if getattr(config, name) not in choices:
             raise ValueError(f"{name} is {getattr(config, name)!r}, but must be "
@@ -148,8 +147,8 @@ def check_config(config):
 
 
 # Our short recipe: a quarter of an hour on the simulated city
-SHORT = dict(max_range=50.0, epochs=9, batch=8, optimizer="muon", lr=1e-2, schedule="one-cycle",
-             swap="both", augment=True, frozen=0.25)
+SHORT = dict(max_range=50.0, epochs=18, batch=16, optimizer="muon", lr=1e-2, schedule="one-cycle",
+             augment=True, frozen=0.25)
 
 # ------------------------------------------------------------------------------------------------
 # 2  Sampling and grouping: sections 3.3.2 and 3.3.3
@@ -421,16 +420,15 @@ class D3DLO(nn.Module):
 CHECKPOINT_EVERY, WEIGHTS_EVERY = 60.0, 300.0  # seconds
 
 
-def training_batch(data, pairs, config, rng, device="cpu"):
-    """Load n pairs of scans -> Batch, and the motions T_pq (B,4,4) to predict.
+def training_batch(data, pairs, config, rng=None, device="cpu"):
+    """Load n pairs of scans -> Batch, and the motions (n,4,4) to predict.
 
     data: see `fit`; pairs: (n,2), the index s of the sequence and i of the scan P; Q is scan i + 1.
-    Each pair is used in one random direction (B = n) or in both (B = 2n). With augmentation, some
-    pairs imitate refinement (part 6): Q may be several scans later, and is aligned with P up to a
-    small motion.
+    With augmentation, some pairs imitate refinement (part 6): Q may be several scans later, and is
+    aligned with P up to a small motion. rng: None to neither augment nor swap the pairs.
     """
-    n = len(pairs)
-    aligned = rng.random(n) < ALIGNED if config.augment else np.zeros(n, bool)
+    n, augmented = len(pairs), config.augment and rng
+    aligned = rng.random(n) < ALIGNED if augmented else np.zeros(n, bool)
     scans_p, scans_q, T_pq = [], [], []
     for (s, i), is_aligned in zip(pairs, aligned):
         records, motions = data[s]
@@ -439,15 +437,14 @@ def training_batch(data, pairs, config, rng, device="cpu"):
         scans_q.append(records[j])
         T_pq.append(functools.reduce(np.matmul, motions[i:j]))  # T_{i,i+1} ... T_{j-1,j}
     scans, T_pq = np.stack(scans_p + scans_q), np.stack(T_pq)  # all P, then all Q
-    if config.augment:
+    if augmented:
         scans, T_pq = augment(scans, T_pq, aligned, rng)
-    p = np.arange(2 * n)  # both directions of each pair
-    q = (p + n) % (2 * n)
-    T = np.concatenate([T_pq, invert(T_pq)])
-    if config.swap == "random":  # section 4: swap P and Q at random, and invert the motion
-        chosen = np.arange(n) + n * rng.integers(2, size=n)
-        p, q, T = p[chosen], q[chosen], T[chosen]
-    return make_batch(scans, p, q, config, device), T
+    p, q = np.arange(n), np.arange(n, 2 * n)
+    if rng:  # section 4: swap P and Q at random, and invert the motion
+        swap = rng.random(n) < 0.5
+        p, q = np.where(swap, q, p), np.where(swap, p, q)
+        T_pq = np.where(swap[:, None, None], invert(T_pq), T_pq)
+    return make_batch(scans, p, q, config, device), T_pq
 
 
 def all_pairs(data):
@@ -458,13 +455,12 @@ def all_pairs(data):
 def steps_per_epoch(pairs, config):
     """Number of batches in an epoch of `pairs` pairs: pairs // batch, at least 1.
 
-    Raises ValueError if a batch would hold one pair in one direction: the final MLP sees one row
-    per pair, so batch normalisation would have no statistics.
+    Raises ValueError if a batch would hold one pair: the final MLP sees one row per pair, so batch
+    normalisation would have no statistics.
     """
-    least = 2 if config.swap == "random" else 1
-    if min(pairs, config.batch) < least:
+    if min(pairs, config.batch) < 2:
         raise ValueError(f"batch size {config.batch} with {pairs} training pairs (consecutive "
-                         f"scans): batch normalisation needs at least {least} pairs per batch")
+                         "scans): batch normalisation needs at least 2 pairs per batch")
     return max(1, pairs // config.batch)
 
 
@@ -529,12 +525,11 @@ def loss_of(net, objective, batch, T):
 
 @torch.inference_mode()
 def held_out_loss(net, objective, data, device):
-    """Mean loss on 500 evenly spaced pairs, or on all if fewer, in both directions."""
-    config = replace(net.config, swap="both", augment=False)
+    """Mean loss on 500 evenly spaced pairs, or on all if fewer."""
     pairs = all_pairs(data)
     chosen = pairs[np.unique(np.linspace(0, len(pairs) - 1, 500).astype(int))]
     parts = np.array_split(chosen, math.ceil(len(chosen) / 16))
-    return np.mean([loss_of(net, objective, *training_batch(data, part, config, None, device))
+    return np.mean([loss_of(net, objective, *training_batch(data, part, net.config, None, device))
                     .item() for part in parts])
 
 
@@ -1267,9 +1262,8 @@ def command_line(argv):
         "start from these weights, a file or the folder of a training run, and keep their network "
         "and input settings"))
     add("--short", action="store_true", help=(
-        "our short recipe, the default without --data: few epochs, points within 50 m, both "
-        "directions, Muon, one-cycle learning rate, augmentation, fixed BatchNorm statistics at "
-        "the end"))
+        "our short recipe, the default without --data: few epochs, points within 50 m, Muon, "
+        "one-cycle learning rate, augmentation, fixed BatchNorm statistics at the end"))
     for name, kind, what in (("epochs", int, "number of epochs"),
                              ("batch", int, "pairs in a batch"),
                              ("lr", float, "initial learning rate; with --short, the peak")):

@@ -69,9 +69,9 @@ generator, inverse = np.random.default_rng, np.linalg.inv
 SMALL = Config(sa1=Layer(2.0, 16, 4, (4, 8, 16)), fe=Layer(None, None, 6, (16, 32)),
                sa2=Layer(4.0, 8, 8, (32, 32)), sa3=Layer(8.0, 4, 4, (32, 32)),
                mpn=Layer(None, None, None, (32, 64)), mlp=Layer(None, None, None, (32, 6)),
-               max_range=50.0, swap="both")
+               max_range=50.0)
 # The paper's training, and one with everything that has a state: nine steps on `two_sequences`
-PAPERS = replace(SMALL, epochs=3, batch=3, swap="random")
+PAPERS = replace(SMALL, epochs=3, batch=3)
 OURS = replace(SMALL, epochs=3, batch=3, augment=True, optimizer="muon", schedule="one-cycle",
                frozen=4 / 9)
 # What a weights file stores about its training data. These ranges fit any scan.
@@ -506,7 +506,7 @@ LAYER = Layer(1.0, 16, 4, (4, 8))
 
 @pytest.mark.parametrize("name, value", [
     ("epochs", 0), ("epochs", 1.5), ("batch", True), ("lr", 0), ("lr", np.nan), ("lr", "1"),
-    ("frozen", 1.0), ("frozen", -0.1), ("max_range", 0), ("optimizer", "sgd"), ("swap", None),
+    ("frozen", 1.0), ("frozen", -0.1), ("max_range", 0), ("optimizer", "sgd"),
     ("schedule", ""), ("plane", "yes"), ("r", LAYER._replace(r=-1.0)),
     ("n_fps", LAYER._replace(n_fps=10**6)), ("n_fps of sa2", LAYER._replace(n_fps=7)),
     ("n_n", LAYER._replace(n_n=0)), ("width", LAYER._replace(widths=(4, 10**6))),
@@ -528,7 +528,7 @@ def test_the_default_is_table_1_with_61290_parameters_and_section_4():
                  sa2=[4.0, 256, 32, [64, 64]], sa3=[8.0, 64, 8, [64, 64]],
                  mpn=[None, None, None, [64, 256]], mlp=[None, None, None, [64, 6]],
                  max_range=None, plane=True, epochs=500, optimizer="adam", schedule="steps",
-                 swap="random", augment=False, frozen=0)
+                 augment=False, frozen=0)
     assert Config().as_dict() == dict(batch=16, lr=1e-3) | paper  # it does not give these two
     adam, = d3dlo.make_optimizers(net, torch.nn.L1Loss())
     assert type(adam) is torch.optim.Adam
@@ -599,9 +599,9 @@ def test_all_tensors_are_made_on_the_device_of_the_input(training):
 # Training
 
 
-@given(SEED, st.sampled_from(["both", "random"]), st.integers(2, 12))
-def test_an_epoch_has_every_pair_once_with_the_motion_in_its_direction(seed, swap, batch):
-    config, data = replace(SMALL, swap=swap, batch=batch), two_sequences()
+@given(SEED, st.integers(2, 12))
+def test_an_epoch_has_every_pair_once_with_the_motion_in_its_direction(seed, batch):
+    config, data = replace(SMALL, batch=batch), two_sequences()
     scan_of = {record["xyz"].tobytes(): (s, i) for s, (records, _) in enumerate(data)
                for i, record in enumerate(records)}
     seen, steps = [], d3dlo.steps_per_epoch(10, config)
@@ -612,24 +612,21 @@ def test_an_epoch_has_every_pair_once_with_the_motion_in_its_direction(seed, swa
             assert s == s_q and abs(i - j) == 1
             motion = data[s][1][min(i, j)]
             assert_allclose(T, motion if i < j else inverse(motion), atol=1e-9)
-            seen.append((s, min(i, j), i < j))
-        if swap == "both":  # both directions are in one batch
-            assert 2 * len({pair[:2] for pair in seen}) == len(seen)
-    assert {pair[:2] for pair in seen} == {(s, i) for s in range(2) for i in range(5)}
-    assert len(seen) == len(set(seen)) == (20 if swap == "both" else 10)
+            seen.append((s, min(i, j)))
+    assert sorted(seen) == [(s, i) for s in range(2) for i in range(5)]
     for size, pairs in ((1, 10), (batch, 1)):  # BatchNorm has no statistics for one row
         with pytest.raises(ValueError, match="at least 2"):
-            d3dlo.steps_per_epoch(pairs, replace(config, swap="random", batch=size))
+            d3dlo.steps_per_epoch(pairs, replace(config, batch=size))
 
 
 def test_pairs_are_swapped_mirrored_aligned_and_moved_as_often_as_they_should():
     rng, mirror, seen = generator(0), np.diag([1, -1, 1, 1]), []
     metres = np.array([1.5, 0.5, 7, 1, 1, 2, 1])
     motions = from_vector(np.outer(metres, [1, 0, 0, 0, 0, 0]) + [0, 0, 0, 0, 0, 30])
-    records, config = records_of(static_world(rng, motions)), replace(OURS, swap="random")
+    records = records_of(static_world(rng, motions))
     for _ in range(250):
         pairs = [(0, i) for i in range(7)]
-        batch, T = d3dlo.training_batch([(records, motions)], pairs, config, rng)
+        batch, T = d3dlo.training_batch([(records, motions)], pairs, OURS, rng)
         numbers = batch.group_sa1[:, 0, 0, 0].int().tolist()  # from the intensities
         assert_array_equal(batch.idx_sa2, records["idx_sa2"][numbers])
         points = torch.cat([batch.xyz[:, :, None], batch.group_sa1[..., 1:]], 2).numpy()
@@ -710,10 +707,8 @@ def test_an_interrupted_run_is_resumed_to_the_same_bits(tmp_path, config, step):
         assert same
     # The test loss is logged and has no other effect
     assert [re.sub(r", test loss \d\.\d{4}", "", line) for line in said] == lines
-    net, errors = load_weights(part)[0], []
-    for records, T in test:
-        for pair, motion in ((records, T), (records[::-1], inverse(T))):
-            errors.append(to_vector(d3dlo.predict_motions(net, pair)) - to_vector(motion))
+    net, _ = load_weights(part)
+    errors = [to_vector(d3dlo.predict_motions(net, records)) - to_vector(T) for records, T in test]
     loss = (np.abs(errors) * checkpoint["parts"][1]["weights"].exp().numpy()).mean()
     assert f", test loss {loss:.4f}" in said[-1]
 
@@ -741,15 +736,19 @@ def test_a_run_that_diverges_says_so_and_keeps_the_last_good_files(
         assert content["step"] == step - 1 and not re.search("nan|inf", repr(content))
 
 
-def test_statistics_are_recomputed_for_each_weights_file_until_they_are_frozen(tmp_path):
-    # Each batch holds all ten pairs, so all batches have the same statistics
+def test_statistics_are_recomputed_for_each_weights_file_until_they_are_frozen(
+        tmp_path, monkeypatch):
+    # Each batch holds all ten pairs, never swapped, so all batches have the same statistics
+    load = d3dlo.training_batch
+    monkeypatch.setattr(d3dlo, "training_batch", lambda data, pairs, config, rng, device: load(
+        data, pairs, config, None, device))
     config, data = replace(SMALL, epochs=6, batch=10, lr=1e-2, frozen=0.5), two_sequences()
     train(tmp_path / "whole", config, objective=Loss())
     train(tmp_path / "half", config, objective=Loss(4), every=0)
     last, half = (torch.load(tmp_path / run / "weights.pt")["model"] for run in ("whole", "half"))
     net, lagging = D3DLO(config), torch.load(tmp_path / "half" / "checkpoint.pt")["parts"][0]
     net.load_state_dict(lagging)
-    update_bn([d3dlo.training_batch(data, d3dlo.all_pairs(data), config, None)], net)
+    update_bn([load(data, d3dlo.all_pairs(data), config)], net)
     for name in [name for name in half if "running" in name]:
         torch.testing.assert_close(half[name], net.state_dict()[name], rtol=1e-3, atol=1e-3)
         assert torch.equal(half[name], last[name]) and not torch.equal(half[name], lagging[name])
@@ -776,16 +775,15 @@ def test_the_test_loss_uses_at_most_500_pairs_spread_over_all_sequences(n, m):
     numbers, records = [], np.zeros(n + m + 2, d3dlo.record_dtype(SMALL))
     motions = from_vector(np.arange(1, n + m + 1)[:, None] * [1, 0, 0, 0, 0, 0])
 
-    def remember(y_hat, y):  # y is the number of the pair, negative in the other direction
+    def remember(y_hat, y):  # y is the number of the pair
         numbers.extend(y[:, 0].round().int().tolist())
         return y.sum()
 
     data = [(records[:n + 1], motions[:n]), (records[n + 1:], motions[n:])]
-    d3dlo.held_out_loss(D3DLO(SMALL).eval(), remember, data, "cpu")
-    chosen = sorted(x for x in numbers if x > 0)
-    assert sorted(-x for x in numbers if x < 0) == chosen
-    assert len({*chosen}) == len(chosen) == min(500, n + m)
-    assert chosen[0] == 1 and chosen[-1] == n + m and len({*np.diff(chosen)}) <= 2  # evenly spread
+    d3dlo.held_out_loss(D3DLO(OURS).eval(), remember, data, "cpu")  # not augmented
+    assert len({*numbers}) == len(numbers) == min(500, n + m)
+    assert numbers[0] == 1 and numbers[-1] == n + m
+    assert np.ptp(np.diff(numbers)) <= 1  # evenly spread
 
 
 # ------------------------------------------------------------------------------------------------

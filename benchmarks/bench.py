@@ -8,8 +8,8 @@
 
 Every measurement runs in a process of its own. In each round this code and its baselines take
 turns, so other work on the machine slows both. The table shows the median time of each, and the
-median and the range of baseline / here over the rounds. A pair-step is one pair of scans, in one
-direction, in one training step.
+median and the range of baseline / here over the rounds. A pair-step is one pair of scans in one
+training step.
 
 With --against, the code in DIR is the baseline: of this version, of a later one, or of commit
 b9e6db3. fpsample and kiss-icp are baselines if they are installed. The processes inherit the
@@ -38,7 +38,7 @@ import kitti
 
 OLD = hasattr(d3dlo, "scan_geometry")  # commit b9e6db3
 SCANS, EPOCHS, WARM_UP = 33, 6, 2  # 32 pairs in two batches an epoch; epochs not counted
-CONFIG = d3dlo.Config(max_range=50.0, epochs=EPOCHS, batch=16, swap="both", augment=True)
+CONFIG = d3dlo.Config(max_range=50.0, epochs=EPOCHS, batch=16, augment=True)
 KITTI_PAIRS = 15960  # pairs of the paper's training split of KITTI
 
 # ------------------------------------------------------------------------------------------------
@@ -116,7 +116,7 @@ def training(s, form, frozen=0.0):
     net, times = d3dlo.D3DLO(replace(CONFIG, frozen=frozen)), []
     with tempfile.TemporaryDirectory() as run:
         d3dlo.fit(net, *data, run, say=lambda line: times.append(time.perf_counter()))
-    return np.median(np.diff(times[WARM_UP - 1:EPOCHS])) / (2 * len(motions))
+    return np.median(np.diff(times[WARM_UP - 1:EPOCHS])) / len(motions)
 
 
 def loader(s, form):
@@ -126,7 +126,7 @@ def loader(s, form):
     """
     device, steps = "cpu" if form == "here" else "meta", 20
     data, work = [prepare(s)], (CONFIG, (0,), 0, steps)
-    return seconds(lambda: [*d3dlo.batches(data, *work, device)], 3) / (2 * CONFIG.batch * steps)
+    return seconds(lambda: [*d3dlo.batches(data, *work, device)], 3) / (CONFIG.batch * steps)
 
 
 def inference(s, form):
@@ -174,13 +174,13 @@ ROWS = {  # measurement, its name in the table, baselines
     "samplings": (functools.partial(records, n=3), "the same, three samplings"),
     "register": (register, "Odometry.register, a scan", "KISS-ICP"),
     "refine": (functools.partial(register, refine=3), "the same, refine=3", "KISS-ICP"),
-    "training": (training, "training, a pair-step in a batch of 32"),
+    "training": (training, "training, a pair-step in a batch of 16"),
     "fixed": (functools.partial(training, frozen=0.999), "the same, fixed statistics"),
     "loader": (loader, "preparing batches, a pair-step", "eq. 4 on the device"),
     "inference": (inference, "network on a pair, records given"),
     "cache": (cache, "sampling and grouping, a sequence", "one worker"),
     "startup": (startup, "d3dlo.py --help", "import torch"),
-    "malloc": (training, "training, a pair-step in a batch of 32", "default malloc"),
+    "malloc": (training, "training, a pair-step in a batch of 16", "default malloc"),
     "memory": (memory, "memory of training")}
 ON_REQUEST = "malloc", "memory"
 AGAINST = "fps", "register", "refine", "training", "fixed"  # rows that --against can compare

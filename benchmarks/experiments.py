@@ -8,9 +8,9 @@
 The first half holds what the paper tried and rejected, as losses and as subclasses of D3DLO. They
 are passed to `d3dlo.train` as its `objective` and its `network`.
 
-A pair-step is one pair of scans, in one direction, in one training step. All runs of a table have
-the same number of pair-steps, in all and in a batch, the same data and, for the same seed, the same
-order of pairs. The recipe is the short one, d3dlo.SHORT.
+A pair-step is one pair of scans in one training step. All runs of a table have the same number of
+pair-steps, in all and in a batch, the same data and, for the same seed, the same order of pairs.
+The recipe is the short one, d3dlo.SHORT.
 
 Every run has a folder in OUT, named by a hash of everything it depends on. Finished runs are not
 repeated, interrupted ones are resumed, and tables share runs. The runs follow each other; to use
@@ -24,7 +24,6 @@ import math
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -203,7 +202,6 @@ class Variant(NamedTuple):
 
 
 T1 = Config()
-RANDOM = dict(swap="random", batch=2 * SHORT["batch"])  # a batch has as many pair-steps as "both"
 TWO_SCALES = dict(sa1=T1.sa1._replace(r=2.0, n_n=4 * T1.sa1.n_n))  # 1 m, 8; 2 m, 32
 PAPER_2 = {  # n_n and plane -> E_t, E_r
     (8, True): (2.19, 0.00855), (16, True): (2.5, 0.01015), (32, True): (2.53, 0.00937),
@@ -251,20 +249,16 @@ EXPERIMENTS = {
     "coordinates": {
         "Table 1": Variant(),
         "coordinates into the mini-PointNet": Variant("DeepCLR's", network=Coordinates)},
-    "swap": {
-        "both directions": Variant(),
-        "one direction at random": Variant("used", RANDOM)},
     "ablation": {
         "our recipe": without(),
         "Adam": without(optimizer="adam"),
         "decays instead of one cycle": without(schedule="steps"),
-        "one direction at random": without(**RANDOM),
         "no augmentation": without(augment=False),
         "no aligned pairs": without(aligned=0.0),
         "no fixed statistics": without(frozen=0.0),
         "all points": without(max_range=None),
-        "the paper's recipe": without(**RANDOM, max_range=None, optimizer="adam", lr=T1.lr,
-                                      schedule="steps", augment=False, frozen=0.0),
+        "the paper's recipe": without(max_range=None, optimizer="adam", lr=T1.lr, schedule="steps",
+                                      augment=False, frozen=0.0),
         "Adam, rate up to 0.003": without(optimizer="adam", lr=3e-3)},
 }
 
@@ -289,12 +283,8 @@ class Run(NamedTuple):
 
 
 def config_of(changes, pairs, budget):
-    """The short recipe with changes. The budget determines the number of epochs, at least one over
-    both directions.
-    """
-    config = replace(Config(**SHORT), **changes)
-    epochs = max(1, round(budget / (2 * pairs)))
-    return replace(config, epochs=epochs if config.swap == "both" else 2 * epochs)
+    """The short recipe with changes. The budget determines the number of epochs, at least one."""
+    return Config(**SHORT | changes | {"epochs": max(1, round(budget / pairs))})
 
 
 def identity(s):
@@ -461,7 +451,7 @@ def main():
     runs = {run.folder: run for rows in planned.values() for row in rows.values() for run in row}
     wanted = {folder: evaluations(run, root, names, args.real) for folder, run in runs.items()}
     todo = [run for folder, run in runs.items() if not all(map(run.results, wanted[folder]))]
-    steps = 2 * pairs * config_of({}, pairs, args.budget).epochs
+    steps = pairs * config_of({}, pairs, args.budget).epochs
     facts = (f"{root}: trained on {' '.join(trained)} ({pairs:,} pairs), {steps:,} pair-steps a "
              f"run, seeds {' '.join(map(str, args.seeds))}")
     print(f"{facts}; {len(runs)} runs, {len(runs) - len(todo)} of them finished", flush=True)
