@@ -1447,6 +1447,7 @@ CASES = [  # commands, and {what the message must say: what spoils good data}
     ((EVAL, TRAIN), {f"w.pt: .*{words}.*give": spoil for words, spoil in {
         "size mismatch": weights(config=Config().as_dict()), "config": weights(config=None),
         "epochs is 0": weights(config=SMALL.as_dict() | {"epochs": 0}),
+        "'swap'": weights(config=SMALL.as_dict() | {"swap": "both"}),  # a setting that is gone
         "model": weights(model=None), "seen": weights(seen=None), "checkpoint": weights(parts=[]),
         "damaged": weights(mean_motion=[math.nan] * 6), "safety": weights(model=Mischief()),
         "zip": put("w.pt", pickle.dumps(Mischief())), "cannot": put("w.pt", lambda b: b[:-2000]),

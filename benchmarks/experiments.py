@@ -367,6 +367,22 @@ def markdown(lines):
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
+def deviations(measured):
+    """Rows of a table: the standard deviation of a seed for each figure, pooled over all variants.
+
+    measured: see `table_of`. With one seed there are no rows.
+    """
+    rows = []
+    for split in next(iter(measured.values())):
+        # (variants,figures,seeds)
+        values = np.array([[*of_splits[split].values()] for of_splits in measured.values()])
+        if values.shape[2] > 1:
+            pooled = np.sqrt(values.var(2, ddof=1).mean(0))
+            cells = [cell([x], digits) for x, digits in zip(pooled, DIGITS.values())]
+            rows.append(["standard deviation of a seed", split, "", "", *cells])
+    return rows
+
+
 def table_of(experiment, rows):
     """The table of an experiment in Markdown, and {variant: {split: {figure: [of each seed]}}}."""
     lines, measured = [HEADER], {}
@@ -377,6 +393,8 @@ def table_of(experiment, rows):
             values = measured[name][split] = {key: [f[key] for f in each] for key in DIGITS}
             cells = [cell(values[key], digits) for key, digits in DIGITS.items()]
             lines.append([name, split, *paper, *cells])
+    if experiment == "ablation":
+        lines += deviations(measured)
     return markdown(lines), measured
 
 
