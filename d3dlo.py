@@ -339,7 +339,7 @@ class MiniPointNet(nn.Module):
         """The output z (...,k,c1) of h's first layer -> its other layers, maximum (...,c')."""
         *sets, k, _ = z.shape
         points = self.h[1:-1](z.flatten(0, -2))  # (points,c'): all points share the MLP
-        # The maximum, by pooling an image with a row per set: amax has a slow backward pass
+        # The maximum over each set, a row of an image. (The backward pass of amax is slow.)
         image = points.view(1, -1, k, points.shape[1]).movedim(3, 1)  # (1,c',sets,k)
         maximum = F.max_pool2d(image, (1, k)).movedim(1, 3)  # (1,sets,1,c')
         # ReLU is non-decreasing, so the last one may come after the maximum
@@ -421,7 +421,7 @@ CHECKPOINT_EVERY, WEIGHTS_EVERY = 60.0, 300.0  # seconds
 
 
 def training_batch(data, pairs, config, rng=None, device="cpu"):
-    """Load n pairs of scans -> Batch, and the motions (n,4,4) to predict.
+    """Load n pairs of scans, swapped at random -> Batch, and the motions T_pq (n,4,4) to predict.
 
     data: see `fit`; pairs: (n,2), the index s of the sequence and i of the scan P; Q is scan i + 1.
     With augmentation, some pairs imitate refinement (part 6): Q may be several scans later, and is

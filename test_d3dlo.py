@@ -604,8 +604,8 @@ def test_an_epoch_has_every_pair_once_with_the_motion_in_its_direction(seed, bat
     config, data = replace(SMALL, batch=batch), two_sequences()
     scan_of = {record["xyz"].tobytes(): (s, i) for s, (records, _) in enumerate(data)
                for i, record in enumerate(records)}
-    seen, steps = [], d3dlo.steps_per_epoch(10, config)
-    for b, T_pq in d3dlo.batches(data, config, (seed,), 0, steps):
+    seen, forward, steps = [], [], d3dlo.steps_per_epoch(10, config)
+    for b, T_pq in d3dlo.batches(data, config, (seed,), 0, 4 * steps):  # four epochs
         assert len(T_pq) >= min(batch, 10)  # no smaller batch at the end
         for p, q, T in zip(b.p, b.q, T_pq, strict=True):
             (s, i), (s_q, j) = (scan_of[b.xyz[c].numpy().tobytes()] for c in (p, q))
@@ -613,7 +613,10 @@ def test_an_epoch_has_every_pair_once_with_the_motion_in_its_direction(seed, bat
             motion = data[s][1][min(i, j)]
             assert_allclose(T, motion if i < j else inverse(motion), atol=1e-9)
             seen.append((s, min(i, j)))
-    assert sorted(seen) == [(s, i) for s in range(2) for i in range(5)]
+            forward.append(i < j)
+    for k in range(0, 40, 10):
+        assert sorted(seen[k:k + 10]) == [(s, i) for s in range(2) for i in range(5)]
+    assert len(seen) == 40 and 0 < sum(forward) < 40
     for size, pairs in ((1, 10), (batch, 1)):  # BatchNorm has no statistics for one row
         with pytest.raises(ValueError, match="at least 2"):
             d3dlo.steps_per_epoch(pairs, replace(config, batch=size))
