@@ -39,7 +39,7 @@ import kitti
 OLD = hasattr(d3dlo, "scan_geometry")  # commit b9e6db3
 SCANS, EPOCHS, WARM_UP = 33, 6, 2  # 32 pairs in two batches an epoch; epochs not counted
 CONFIG = d3dlo.Config(max_range=50.0, epochs=EPOCHS, batch=16, augment=True)
-KITTI_PAIRS = 15960  # pairs of the paper's training split of KITTI
+KITTI_SCANS = 15965  # scans of the paper's training split of KITTI
 
 # ------------------------------------------------------------------------------------------------
 # Measurements: functions of a `kitti.Sequence` and of a form, which is "here" or a baseline's name.
@@ -89,7 +89,7 @@ def records(s, form, n=1):
 
 def register(s, form, refine=0):
     """Registering a scan of a stream. The scans are in memory."""
-    scans = [s.scan(i) for i in range(min(SCANS, len(s)))]
+    scans = [s.scan(i) for i in range(SCANS)]
     if form == "KISS-ICP":
         from classical import KissIcp  # beside this file
         work = KissIcp().register
@@ -101,10 +101,10 @@ def register(s, form, refine=0):
 
 def prepare(s):
     """Records (n,) and motions (n-1,4,4) of the first scans."""
-    scans = [s.scan(i) for i in range(min(SCANS, len(s)))]
+    scans = [s.scan(i) for i in range(SCANS)]
     sampled = [d3dlo.scan_geometry(scan, CONFIG)[None] if OLD else d3dlo.scan_records(scan, CONFIG)
                for scan in scans]
-    return np.concatenate(sampled), s.motions()[:len(scans) - 1]
+    return np.concatenate(sampled), s.motions()[:SCANS - 1]
 
 
 def training(s, form, frozen=0.0):
@@ -159,7 +159,7 @@ def memory(s, form):
     """Peak memory of a training run, without the pages of its cache, a text."""
     training(s, form)
     peak = int(re.search(r"VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text())[1])
-    cache = (KITTI_PAIRS + 1) * d3dlo.record_dtype(CONFIG).itemsize
+    cache = KITTI_SCANS * d3dlo.record_dtype(CONFIG).itemsize
     return (f"training: {peak / 2**20:.2f} GiB, and up to {cache / 2**30:.2f} GiB for the pages of "
             "the cache of the paper's training split")
 
@@ -252,8 +252,8 @@ def main():
     try:
         root = args.data or kitti.simulate("data/bench", sequences=["00"], scans=100)
         s = max(kitti.open_sequences(root, args.sequence), key=len)
-        if len(s.motions()) < 4:  # ValueError without ground truth
-            raise ValueError(f"sequence {s.name} has {len(s)} scans, but 5 are needed")
+        if len(s.motions()) < SCANS - 1:  # ValueError without ground truth
+            raise ValueError(f"sequence {s.name} has {len(s)} scans, but {SCANS} are needed")
     except (ValueError, OSError) as error:
         sys.exit(f"bench: {error}")
     versions = ", ".join(f"{name} {value}" for name, value in kitti.versions(HERE).items())

@@ -2,7 +2,7 @@
 
     pip install kiss-icp==1.3.0
     python benchmarks/classical.py ROOT OUT          # ROOT in KITTI odometry layout, with poses
-    python benchmarks/classical.py ROOT OUT --sequences drive0005 drive0013
+    python benchmarks/classical.py ROOT OUT --sequences 2011_09_26_drive_0005
 
 KISS-ICP aligns each scan with a map of the scans before it. Writes OUT/NN.txt, KITTI pose files in
 the rectified left camera frame, and OUT/results.json. Prints the settings, and a table of errors.
@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import d3dlo
 import kitti
 import metrics
 
@@ -44,6 +45,7 @@ class KissIcp:
 
 def evaluate(root, names, out):
     """Write OUT/NN.txt and OUT/results.json for some sequences of `root`, and print the table."""
+    d3dlo.check_output(out, "results", root)
     settings = KissIcp().settings
     method = f"KISS-ICP {version('kiss-icp')}"
     print(method, *(f"{part}: {values}" for part, values in settings.items()), sep="\n")
@@ -72,7 +74,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__,
                                      formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("root", metavar="ROOT")
-    parser.add_argument("out", metavar="OUT", type=Path)
+    parser.add_argument("out", metavar="OUT", type=Path, help="new or empty folder")
     parser.add_argument("--sequences", nargs="+", default="all", metavar="NN", help="default: all")
     args = parser.parse_args()
     try:

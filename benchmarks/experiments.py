@@ -315,7 +315,7 @@ def evaluations(run, root, sequences, real):
     """
     if run.experiment != "ablation":
         return {"all": (root, sequences, 0)}
-    every = {"all": (root, ["test"], 0), "all-refined": (root, ["test"], 3)}
+    every = {"all": (root, sequences, 0), "all-refined": (root, ["test"], 3)}
     if real:
         every |= {"real": (real, ["all"], 0), "real-refined": (real, ["all"], 3)}
     return every
@@ -466,8 +466,10 @@ def main():
     names = [s.name for s in sequences]
     data = trained, {s.name: identity(s) for s in sequences}
     planned = plan(args.experiments, pairs, args.budget, args.seeds, args.out, data)
-    runs = {run.folder: run for rows in planned.values() for row in rows.values() for run in row}
-    wanted = {folder: evaluations(run, root, names, args.real) for folder, run in runs.items()}
+    runs, wanted = {}, {}  # by folder; experiments share runs, but not all evaluations
+    for run in [run for rows in planned.values() for row in rows.values() for run in row]:
+        runs[run.folder] = run
+        wanted.setdefault(run.folder, {}).update(evaluations(run, root, names, args.real))
     todo = [run for folder, run in runs.items() if not all(map(run.results, wanted[folder]))]
     steps = pairs * config_of({}, pairs, args.budget).epochs
     facts = (f"{root}: trained on {' '.join(trained)} ({pairs:,} pairs), {steps:,} pair-steps a "

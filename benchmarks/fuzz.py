@@ -155,7 +155,11 @@ def read_raw(drive, path):
     """Convert a raw drive, one of whose files is `path` -> the poses of its scans."""
     shutil.rmtree("converted", ignore_errors=True)
     with contextlib.redirect_stderr(io.StringIO()):
-        names = list(kitti.convert_raw(drive, "converted"))
+        try:
+            names = list(kitti.convert_raw(drive, "converted"))
+        except (ValueError, OSError):
+            assert not Path("converted").exists()
+            raise
     return np.concatenate([s.poses for s in kitti.open_sequences("converted", names)])
 
 

@@ -54,7 +54,8 @@ def tour(notebook):
                                     "data": {"image/png": image}})
         plt.close("all")
     text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
-    notebook.write_text(text, encoding="utf-8")
+    with metrics.replacing(notebook) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def network():
@@ -101,6 +102,8 @@ def network():
 def paths(root, plain, refined, sequences):
     """Draw the true and the predicted paths of sequences from above."""
     drives = kitti.open_sequences(root, sequences)
+    for s in drives:
+        s.motions()  # ValueError without ground truth
     estimates = {label: [metrics.read_poses(folder / f"{s.name}.txt") for s in drives]
                  for label, folder in (("plain", plain), ("refined", refined))}
     figure = metrics.new_figure(4.2 * len(drives), 4.6)

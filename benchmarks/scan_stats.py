@@ -3,8 +3,8 @@
     python benchmarks/scan_stats.py ROOT [NN ...]  # folder in KITTI odometry layout, with poses
     python benchmarks/scan_stats.py data/full 00 01 02 08 09
 
-Each line averages 8 pairs of consecutive scans, spread evenly over a sequence and cropped as for
-the pretrained weights:
+Each line averages 8 pairs of consecutive scans, spread evenly over a sequence. Points and centroids
+are cropped as for the pretrained weights, the neighbours below are not:
 
     points      number of usable points
     intensity   mean intensity
@@ -42,7 +42,7 @@ def pair_stats(scan_p, scan_q, T_pq, config):
     record, = d3dlo.scan_records(scan_p, config)
     xyz = record["xyz"].astype(float)
     raised = xyz[xyz[:, 2] > RAISED]  # (n,3)
-    p, q = scan_p[:, :3].astype(float), scan_q[:, :3].astype(float)
+    p, q = (kitti.usable_points(scan)[0][:, :3].astype(float) for scan in (scan_p, scan_q))
     std = np.full((len(raised), 3), np.nan)  # standard deviations along the principal axes
     for i, near in enumerate(cKDTree(p).query_ball_point(raised, 1.0)):
         if len(near) >= 5:
