@@ -4,7 +4,7 @@ The network takes two consecutive LiDAR scans P and Q and predicts the rigid mot
 Read this file beside the paper, from top to bottom:
 
     1  Table 1 and the settings               5  Odometry: eq. 1
-    2  Sampling and grouping: 3.3.2, 3.3.3    6  Our additions: augmentation and refinement
+    2  Sampling and grouping: 3.3.2, 3.3.3    6  Our additions: more augmentation, refinement
     3  The network: 3.3, eqs. 3 and 4         7  Evaluation: section 5
     4  Training: eq. 2, section 4             8  The commands train and eval
 
@@ -13,8 +13,9 @@ the vectors of section 3.2. metrics.py computes E_t and E_r, eqs. 6 to 8. What t
 rejected is in benchmarks/experiments.py. docs/paper-differences.md lists where we differ from it.
 
 Frame: Velodyne, x forward, y left, z up, in metres. T_ab maps points from frame b to frame a;
-T_pq is the paper's T_{t,t+1}. Shapes: N points of a scan, S centroids, k neighbours, c features,
-C scans in a batch, B pairs of them; n1 to n3 and k1 to k3 are n_fps and n_n of SA1 to SA3.
+T_pq is the paper's T_{t,t+1}. Shapes: N points of a scan, n of a layer's input, S centroids, k
+neighbours, c features, C scans in a batch, B pairs of them; n1 to n3 and k1 to k3 are n_fps and n_n
+of SA1 to SA3. (The paper's n_1 and n_2 are the numbers of points of P and Q.)
 
     python d3dlo.py train                       # on a simulated city; 15 minutes on a CPU
     python d3dlo.py train --data ROOT           # on KITTI odometry, with the paper's settings
@@ -95,9 +96,8 @@ class Config:
     optimizer: str = "adam"  # the paper's; or ours, "muon": Muon for the hidden layers
     lr: float = 1e-3  # learning rate: Adam's default; with "one-cycle" the peak
     schedule: str = "steps"  # lr / 10 (factor ours) after 3/5 and 4/5 of the steps; or "one-cycle"
-    augment: bool = False  # ours: also mirror pairs and move Q by small random motions
-    frozen: float = 0.0  # ours: share of the steps, at the end, with fixed BatchNorm statistics;
-    # the weights are still trained
+    augment: bool = False  # ours, beyond section 4's swap: mirror pairs, move Q, align some pairs
+    frozen: float = 0.0  # ours: train this last share of the steps with fixed BatchNorm statistics
 
     def __post_init__(self):
         # JSON turns a Layer into a list. Turn it back; an immutable class needs object.__setattr__.
@@ -155,15 +155,15 @@ SHORT = dict(max_range=50.0, epochs=18, batch=16, optimizer="muon", lr=1e-2, sch
 
 
 def farthest_point_sampling(xyz: np.ndarray, n: int) -> np.ndarray:
-    """Farthest point sampling: each new centroid is the point farthest from all centroids so far.
+    """Farthest point sampling: each new centroid is the point farthest from its nearest centroid.
 
     xyz (N,3), finite -> indices (n,) int64 of the centroids. The first is point 0. Of equally far
     points the one with the smallest x is taken. The result is nested: its first m indices are the
     result for n = m. Raises ValueError unless 0 < n <= N.
 
-    The trick: let r be the distance of the new centroid from the nearest earlier one. No point is
-    farther from all earlier ones, so only points closer than r to the new one are affected. Sorted
-    by x, they lie in a slice.
+    The trick: let r be the distance of the new centroid from its nearest earlier one. No point is
+    farther than r from its own nearest one, so only for points closer than r to the new centroid
+    does the nearest one change. Sorted by x, they lie in a slice.
     """
     if not 0 < n <= len(xyz):
         raise ValueError(f"cannot sample {n} of {len(xyz)} points")
@@ -214,7 +214,7 @@ def record_dtype(config):
     """The dtype of a record, one sampled scan: what the network needs of it, and facts about it."""
     n1, n2, n3 = config.sa1.n_fps, config.sa2.n_fps, config.sa3.n_fps
     return np.dtype([
-        ("xyz", "f4", (n1, 3)),  # centroids of SA1; the first n2 are SA2's, the first n3 SA3's
+        ("xyz", "f4", (n1, 3)),  # centroids of SA1 [m]; the first n2 are SA2's, the first n3 SA3's
         ("group_sa1", "f4", (n1, config.sa1.n_n, 4)),  # SA1's neighbours: f_i, x_i - x'_j [m]
         ("idx_sa2", "u2", (n2, config.sa2.n_n)),  # SA2's neighbours, indices into SA1's centroids
         ("idx_sa3", "u2", (n3, config.sa3.n_n)),  # SA3's neighbours, indices into SA2's centroids
@@ -228,9 +228,10 @@ def scan_records(scan: np.ndarray, config: Config = Config(), n: int = 1) -> np.
     """Sample and group a scan n times for all three set abstractions: (N,4) -> records (n,).
 
     scan: x, y, z [m] in the Velodyne frame, and intensity 0 to 1. Nothing is learned here, so a
-    record is computed once for every scan and kept. Refinement uses n > 1: record k takes its
-    centroids from every n-th point, starting with point k, so no two records share one. With fewer
-    than n * n1 points, some records are equal. Raises ValueError if too few points are usable.
+    record is computed once for every scan and kept. Refinement (part 6) uses n > 1: record k takes
+    its centroids from every n-th usable point, starting with point k, so no two records share a
+    centroid. With fewer than n * n1 points there are fewer such samplings, and records repeat.
+    Raises ValueError if too few points are usable.
     """
     scan, invalid = kitti.usable_points(scan, config.max_range, config.plane)
     sa1, sa2, sa3 = config.sa1, config.sa2, config.sa3
@@ -268,8 +269,8 @@ def scan_records(scan: np.ndarray, config: Config = Config(), n: int = 1) -> np.
 class Batch(NamedTuple):
     """The network's input: C scans and B pairs (P, Q) of them. A scan may be in several pairs."""
 
-    xyz: torch.Tensor  # (C,n1,3) centroids
-    group_sa1: torch.Tensor  # (C,n1,k1,4)
+    xyz: torch.Tensor  # (C,n1,3) centroids [m]
+    group_sa1: torch.Tensor  # (C,n1,k1,4) f_i, x_i - x'_j [m]
     idx_sa2: torch.Tensor  # (C,n2,k2)
     idx_sa3: torch.Tensor  # (C,n3,k3)
     p: torch.Tensor  # (B,) index of P among the scans
@@ -324,9 +325,9 @@ class MiniPointNet(nn.Module):
     def over_neighbours(self, a, b, idx):
         """max h(a_m + b_s) over the neighbours m of each s, given by idx (B,S,k).
 
-        a (B,n,c), b (B,S,c) -> (B,S,c'). The trick: h's first layer is linear, so
-        W (a_m + b_s) + w = W a_m + (W b_s + w). This takes n + S rows before the neighbours are
-        gathered, instead of S k rows after that.
+        a (B,n,c), b (B,S,c) -> (B,S,c'). The trick: h's first layer is linear, with weight W and
+        bias w, so W (a_m + b_s) + w = W a_m + (W b_s + w). W is applied to n + S rows before the
+        neighbours are gathered, and not to S k rows afterwards.
         """
         u = F.linear(a, self.h[0].weight)  # (B,n,c1)
         v = self.h[0](b)  # (B,S,c1)
@@ -336,10 +337,10 @@ class MiniPointNet(nn.Module):
         return self.after_first_layer(u_m + v[:, :, None])
 
     def after_first_layer(self, z):
-        """The output z (...,k,c1) of h's first layer -> its other layers, maximum (...,c')."""
+        """The output z (...,k,c1) of h's first layer -> the maximum of h's output (...,c')."""
         *sets, k, _ = z.shape
         points = self.h[1:-1](z.flatten(0, -2))  # (points,c'): all points share the MLP
-        # The maximum over each set, a row of an image. (The backward pass of amax is slow.)
+        # The maximum over each set, as a row of an image. (The backward pass of amax is slow.)
         image = points.view(1, -1, k, points.shape[1]).movedim(3, 1)  # (1,c',sets,k)
         maximum = F.max_pool2d(image, (1, k)).movedim(1, 3)  # (1,sets,1,c')
         # ReLU is non-decreasing, so the last one may come after the maximum
@@ -538,8 +539,9 @@ def fit(net, data, run, test=(), seed=0, device="cpu", objective=None, checkpoin
     """Train `net` in place as `net.config` says (section 4), and write RUN/weights.pt.
 
     data: for each sequence a tuple of its records (n,) and its T_{t,t+1} (n-1,4,4).
-    test: the same for the test sequences. Their loss is reported after every epoch, no more.
-    seed: random seed for pair order and augmentation.
+    test: the same for the test sequences. Their loss is reported after every epoch, and used for
+        nothing else.
+    seed: random seed for the order of the pairs, their directions and augmentation.
     objective: a module (y_hat, y) -> loss. None: eq. 2.
     checkpoint: the content of RUN/checkpoint.pt, to continue from it.
     say: called with each line to report.
@@ -561,7 +563,7 @@ def fit(net, data, run, test=(), seed=0, device="cpu", objective=None, checkpoin
     parts = [net, objective, *optimizers, *schedulers]  # all that a step changes
     step, losses = 0, []  # losses of this epoch
     if checkpoint:
-        with reading_weights(run / "checkpoint.pt"):
+        with reading_weights(run / "checkpoint.pt", NEW_START):
             step, losses = checkpoint["step"], checkpoint["losses"]
             for part, state in zip(parts, checkpoint["parts"], strict=True):
                 part.load_state_dict(state)
@@ -635,26 +637,29 @@ def save(path, **content):
         temporary.write_bytes(file.getbuffer())
 
 
+NEW_START = "delete it to train from the start"
+
+
 @contextmanager
-def reading_weights(path):
-    """Turn every exception into a ValueError with one line about the file."""
+def reading_weights(path, remedy="give a weights.pt or the folder of a training run"):
+    """Turn every exception into a ValueError with one line about the file and the remedy."""
     try:
         yield
     except Exception as error:  # torch and pickle raise many exception types for a bad file
         reason = f"{type(error).__name__}: {error}".splitlines()[-1].strip()
         if isinstance(error, pickle.UnpicklingError):  # torch's own text is long
             reason = "it is damaged, or holds Python objects, which are not loaded for safety"
-        raise ValueError(f"{path}: cannot be read as D3DLO weights ({reason:.120}); give a "
-                         "weights.pt or the folder of a training run") from None
+        raise ValueError(f"{path}: cannot be read as D3DLO weights ({reason:.120}); "
+                         f"{remedy}") from None
 
 
 def read_archive(path):
     """The content of a weights file or checkpoint, a dict. Code in the file is never run."""
-    archive = zipfile.ZipFile(path)
-    if any(entry.compress_type for entry in archive.infolist()):  # torch never compresses
-        raise ValueError("compressed")
-    if archive.testzip():  # torch does not verify the archive's checksums
-        raise ValueError("damaged")
+    with zipfile.ZipFile(path) as archive:
+        if any(entry.compress_type for entry in archive.infolist()):  # torch never compresses
+            raise ValueError("compressed")
+        if archive.testzip():  # torch does not verify the archive's checksums
+            raise ValueError("damaged")
     return dict(torch.load(path, map_location="cpu", weights_only=True))
 
 
@@ -775,7 +780,7 @@ class Odometry:
             pair = np.stack([last_records[0], records[0]])
             T_pq, = predict_motions(self.net, pair, self.device)
             pose = last_pose @ T_pq  # eq. 1
-        # Refine the pose: once with a keyframe, an earlier scan that is replaced every few metres,
+        # Refine the pose: first with a keyframe, an earlier scan that is replaced every few metres,
         # then with the last scan. The keyframe limits how fast errors add up from scan to scan.
         if self.refine and self.keyframe:
             references = [self.keyframe] + [self.last] * (self.refine - 1)
@@ -799,7 +804,7 @@ def relative_pose(scan_p: np.ndarray, scan_q: np.ndarray, weights: str | Path | 
 
 
 # ------------------------------------------------------------------------------------------------
-# 6  Our additions, not in the paper: augmentation and refinement
+# 6  Our additions, not in the paper: more augmentation, and refinement
 
 ALIGNED = 1 / 3  # with augmentation, the share of pairs in which Q is first aligned with P
 KEYFRAME_DISTANCE, KEYFRAME_ANGLE = 5.0, 20.0  # [m], [deg] at which refinement takes a new keyframe
@@ -828,7 +833,8 @@ def augment(scans, T_pq, aligned, rng):
     n = len(T_pq)
     mirror = np.where(rng.random((n, 1, 1)) < 0.5, np.diag([1.0, -1, 1, 1]), np.eye(4))
     T_pq = mirror @ T_pq @ mirror
-    scale = [0.25, 0.1, 0.03, 0.1, 0.1, 1.0]  # m, degrees; largest in yaw, since turns are rare
+    # Standard deviations [m], [deg]; the angle is largest in yaw, since turns are rare
+    scale = [0.25, 0.1, 0.03, 0.1, 0.1, 1.0]
     small = from_vector(rng.normal(size=(n, 6)) * scale)
     A = small @ np.where(aligned[:, None, None], T_pq, np.eye(4))
     return move_scans(scans, np.concatenate([mirror, A @ mirror])), T_pq @ invert(A)
@@ -936,7 +942,9 @@ def predict_poses(odometry, s, records):
 def sequence_errors(s, poses, mean_motion):
     """Estimated poses (n,4,4) -> {predictor: (segment errors (segments,), step errors (n-1,2))}.
 
-    The predictors are "network" and the BASELINES. Returns {} without ground truth.
+    The poses are in the Velodyne frame, and so are the step errors. The segment errors are in the
+    camera frame, as in KITTI. mean_motion (6,): see `to_vector`. The predictors are "network" and
+    the BASELINES. Returns {} without ground truth.
     """
     if s.poses is None:
         return {}
@@ -969,9 +977,12 @@ def summarize(errors, trained_on):
 
 def results_table(results):
     """Format the result of `summarize` as a table, followed by a legend of units and frames."""
-    rows = [(name + " *" * s["trained_on"], s) for name, s in results["sequences"].items()]
+    def row(name, s):
+        return f"{name} *" if s["trained_on"] else name, s
+
+    rows = [row(name, s) for name, s in results["sequences"].items()]
     for name, s in [*results["splits"].items(), ("all", results["pooled"])]:
-        rows.append((name + " *" * s["trained_on"], s))
+        rows.append(row(name, s))
         rows += [(f"  {predictor}", s[predictor]) for predictor in BASELINES]
     rows += results["lengths"].items()
     return f"{metrics.table(rows)}\n{LEGEND}"
@@ -1050,7 +1061,8 @@ def check_device(device):
 
 
 def check_output(out, kind, root):
-    """Raise ValueError unless results can go to `out`, a new or empty folder outside the data.
+    """Raise ValueError unless results can go to `out`, a new or empty folder that is not in
+    ROOT/sequences or ROOT/poses.
 
     out: None for a new folder in the folder `kind`; root: the folder of the data. Links are
     resolved.
@@ -1097,7 +1109,7 @@ def data_root(data, names):
 
 
 def choose_sequences(root, names=None):
-    """Open the sequences to train on, and those of the test and validation splits. Two lists.
+    """Open the sequences to train on, and the others of the test and validation splits. Two lists.
 
     names: sequences or splits to train on. None for the training split or, if `root` has nothing of
     it, for all sequences outside the test and validation splits. Raises ValueError if there is
@@ -1116,10 +1128,11 @@ def choose_sequences(root, names=None):
 
 
 def training_facts(fingerprints, motions, records, earlier):
-    """What a weights file stores about its training data.
+    """What a weights file stores about its training data, a dict.
 
     fingerprints, motions, records: of each sequence. earlier: these facts in the weights that
-    training starts from, or {}. The mean motion is that of the new data.
+    training starts from, or {}. Returns trained_on: the fingerprints; mean_motion (6,): that of the
+    new data, see `to_vector`; seen (2,4): smallest and largest kitti.STATS of a scan.
     """
     stats = np.vstack([*(r["stats"] for r in records), *earlier.get("seen", ())])
     return {"trained_on": sorted({*fingerprints, *earlier.get("trained_on", ())}),
@@ -1176,10 +1189,11 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device=None,
     torch.manual_seed(seed)
     net, checkpoint, earlier = build(network, config), None, {}
     if resume and (stored := run / "checkpoint.pt").exists():
-        with reading_weights(stored):
+        with reading_weights(stored, NEW_START):
             checkpoint = earlier = read_archive(stored)
     elif weights:
         net, earlier = load_weights(weights, network)
+        # SHORT names every setting of the training, and one of the input, max_range
         settings = {name: getattr(config, name) for name in SHORT if name != "max_range"}
         net.config = replace(net.config, **settings)
 
@@ -1197,9 +1211,9 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device=None,
         raise ValueError(f"{run}: the data has changed since this training run started; resume it "
                          "with the data it was started with")
 
-    arguments = dict(data=data, sequences=names, seed=int(seed), device=device, weights=weights)
-    versions = kitti.versions(Path(__file__).parent) | {"d3dlo": __version__}
     if not resume:
+        arguments = dict(data=data, sequences=names, seed=int(seed), device=device, weights=weights)
+        versions = kitti.versions(Path(__file__).parent) | {"d3dlo": __version__}
         run = claim_output(out, "runs", "config.json", {
             "arguments": arguments, "config": net.config.as_dict(), "versions": versions})
 
@@ -1227,15 +1241,17 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device=None,
     except KeyboardInterrupt:
         advice = f"continue with `python d3dlo.py train --out {run} --resume`"
         raise KeyboardInterrupt(advice) from None
+    on_data = f" --data {data}" if data else ""
     say(f"weights       {run}/weights.pt\n"
-        f"next          python d3dlo.py eval --weights {run}{f' --data {data}' * bool(data)}")
+        f"next          python d3dlo.py eval --weights {run}{on_data}")
     return run
 
 
 def command_line(argv):
     """Parse the arguments. Returns {option: value} of the options given.
 
-    The signatures of `train` and `evaluate` hold the defaults of all other options.
+    The defaults of the others are in `Config` and `SHORT`, and in the signatures of `train` and
+    `evaluate`.
     """
     settings = dict(formatter_class=argparse.RawDescriptionHelpFormatter,
                     argument_default=argparse.SUPPRESS)
@@ -1274,7 +1290,8 @@ def command_line(argv):
     add("--no-plane", action="store_false", dest="plane", help=(
         "remove the points of the ground plane, Table 2"))
     add("--seed", type=int, metavar="N", help=(
-        "random seed for initialisation, pair order and augmentation (default: 0)"))
+        "random seed for initialisation, order and direction of pairs, and augmentation "
+        "(default: 0)"))
     add("--resume", action="store_true", help=(
         "continue the training run in --out with the options it was started with; only --device "
         "may be given, too"))
@@ -1308,7 +1325,7 @@ def config_from(args):
 
 
 def main(argv=None):
-    """Run the command line. Returns the exit code: 0, 2 for bad input, 130 when interrupted."""
+    """Run the command line. Returns the exit code of `metrics.run_command`."""
     args = command_line(argv)
     command = args.pop("command")
     kitti.keep_freed_memory()
@@ -1328,9 +1345,11 @@ def main(argv=None):
     if "device" not in args and torch.cuda.is_available():
         print("d3dlo: there is a GPU; --device cuda uses it (nobody has tested it)",
               file=sys.stderr)
-    advice = "run it again" + ", with a new --out" * ("out" in args)
     if command == "train":
-        advice = "continue with `python d3dlo.py train --out RUN --resume`"
+        advice = ("run it again or, if it has named its folder RUN, continue with "
+                  "`python d3dlo.py train --out RUN --resume`")
+    else:
+        advice = "run it again, with a new --out" if "out" in args else "run it again"
     return metrics.run_command("d3dlo", work, advice)
 
 

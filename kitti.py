@@ -19,6 +19,7 @@ import functools
 import hashlib
 import importlib.metadata
 import json
+import multiprocessing
 import os
 import platform
 import re
@@ -171,7 +172,7 @@ def read_scan(path: str | Path, intensity_max: float = 1) -> np.ndarray:
     if not _is_scan(scan):
         advice = "save these columns as float32"
         for kind, (dtype, columns) in OTHER_COLUMNS.items():
-            numbers = np.frombuffer(data[:len(data) // 8 * 8], dtype)
+            numbers = np.frombuffer(data, dtype)
             if len(data) and len(numbers) % columns == 0 and _is_scan(numbers.reshape(-1, columns)):
                 advice = (f"it looks like {kind}; convert it with np.save(NEW, np.fromfile(OLD, "
                           f"'{dtype}').reshape(-1, {columns})[:, :4])")
@@ -186,14 +187,14 @@ def _read_npy(path):
     """The array (N,3) or (N,4) of a .npy file."""
     try:
         points = np.load(path, allow_pickle=False)
-        shape, kind = points.shape, points.dtype.kind
+        shape, dtype = points.shape, points.dtype
     except OSError:
         raise
     except Exception:  # np.load raises many exception types; all of them mean a corrupt file
         raise ValueError(f"{path} is damaged or not a NumPy file: save the scan again.") from None
-    if len(shape) != 2 or shape[0] == 0 or shape[1] not in (3, 4) or kind not in "fiu":
-        raise ValueError(f"{path} has shape {shape}, but a scan is an array of numbers (N,3) or "
-                         "(N,4): save the columns x, y, z and intensity.")
+    if len(shape) != 2 or shape[0] == 0 or shape[1] not in (3, 4) or dtype.kind not in "fiu":
+        raise ValueError(f"{path} has shape {shape} of {dtype}, but a scan is an array of numbers "
+                         "(N,3) or (N,4): save the columns x, y, z and intensity.")
     return points
 
 
@@ -205,7 +206,7 @@ def scans_in(folder):
     """
     paths = [path for path in Path(folder).glob("[!.]*") if path.suffix in (".bin", ".npy")]
     if all(re.fullmatch(r"\d+(\.\d+)?", path.stem) for path in paths):
-        return sorted(paths, key=lambda path: Decimal(path.stem))
+        return sorted(paths, key=lambda path: (Decimal(path.stem), path.name))
     return sorted(paths, key=lambda path: re.sub(r"\d+", lambda n: n[0].zfill(20), path.name))
 
 
@@ -268,7 +269,7 @@ class Sequence:
         self.Tr = self.poses_cam = self.poses = None
         self.intensity_max, self.notes = 1, []
         if truth:
-            self._open_kitti(truth)
+            self._open_kitti(Path(truth))
         else:
             self._open_folder()
 
@@ -595,7 +596,7 @@ def in_processes(function, tasks, workers=None, chunksize=4):
     """
     if not tasks:
         return
-    pool = ProcessPoolExecutor(workers or cores(), initializer=_obey, initargs=(os.getpid(),))
+    pool = ProcessPoolExecutor(workers or cores(), initializer=_obey)
     try:
         yield from pool.map(function, tasks, chunksize=chunksize)
     except BrokenExecutor:
@@ -606,12 +607,11 @@ def in_processes(function, tasks, workers=None, chunksize=4):
         pool.shutdown(cancel_futures=True)
 
 
-def _obey(parent):
+def _obey():
     """Make a worker ignore Ctrl-C, which the parent handles, and end at SIGTERM or with the parent.
     """
     def end_with_parent():
-        while os.getppid() == parent:
-            time.sleep(1)
+        multiprocessing.parent_process().join()
         os._exit(1)
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -759,20 +759,20 @@ def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int
                          f"unpack {name}_sync.zip again.")
     T_imu = _imu_poses(packets[nearest], delay / SECOND)  # (n,4,4)
 
-    # Split the drive at the gaps, and write all parts or none
+    # Split the drive at the gaps. Poses and folders appear when all parts are written
     runs = np.split(has_pose, np.flatnonzero(np.diff(numbers[has_pose]) != 1) + 1)
     parts = {f"{name}-{i}" if len(runs) > 1 else name: run for i, run in enumerate(runs, 1)}
     for part in parts:
         for path in (root / "sequences" / part, root / "poses" / f"{part}.txt"):
             if path.exists():
                 raise ValueError(f"{path} already exists: remove it or choose another ROOT.")
-    with ExitStack() as folders:
+    with ExitStack() as stack:
         for part, run in parts.items():
-            folder = folders.enter_context(new_folder(root / "sequences" / part))
-            _write_raw_sequence(folder, [scans[i] for i in run], Tr, times[run])
-        for part, run in parts.items():
+            truth = stack.enter_context(replacing(root / "poses" / f"{part}.txt"))
             T = invert(T_imu[run[0]]) @ T_imu[run]  # relative to the first pose, IMU frame
-            write_poses(root / "poses" / f"{part}.txt", velo_to_camera(T, Tr @ T_velo_imu))
+            write_poses(truth, velo_to_camera(T, Tr @ T_velo_imu))
+            folder = stack.enter_context(new_folder(root / "sequences" / part))
+            _write_raw_sequence(folder, [scans[i] for i in run], Tr, times[run])
     return {part: (int(numbers[run[0]]), int(numbers[run[-1]])) for part, run in parts.items()}
 
 
@@ -802,7 +802,8 @@ def _raw_stream(folder, suffix):
     where the recording has lost a file, as in drive 2011_09_26_drive_0009.
     """
     lines = (folder / "timestamps.txt").read_bytes().decode("utf-8", "replace").splitlines()
-    paths = sorted(path for path in folder.glob(f"data/*{suffix}") if path.stem.isdecimal())
+    paths = sorted(path for path in folder.glob(f"data/*{suffix}")
+                   if re.fullmatch("[0-9]{10}", path.stem))
     numbers = np.array([int(path.stem) for path in paths], int)
     if not paths:
         raise FileNotFoundError(errno.ENOENT, "", str(folder / "data" / f"0000000000{suffix}"))
@@ -820,9 +821,9 @@ def _raw_stream(folder, suffix):
 def _read_packet(path):
     """Read a GPS/IMU packet: (30,) numbers in the order of oxts/dataformat.txt."""
     packet = parse(path.read_bytes().split(), 30)
-    if not np.isfinite(packet).all():
-        raise ValueError(f"{path} is damaged: a GPS/IMU packet is 30 finite numbers; "
-                         "unpack the drive again.")
+    if not (np.isfinite(packet).all() and abs(packet[0]) < 90):
+        raise ValueError(f"{path} is damaged: a GPS/IMU packet is 30 finite numbers, the first a "
+                         "latitude; unpack the drive again.")
     return packet
 
 
@@ -1607,9 +1608,11 @@ def _is_complete(root, name, settings):
 
 
 def _simulate_sequence(root, name, settings, workers):
-    """Write ROOT/sequences/NAME and ROOT/poses/NAME.txt. The folder appears when complete."""
+    """Write ROOT/sequences/NAME and ROOT/poses/NAME.txt."""
     T = _world(name, settings["seed"], settings["scans"]).T
-    with new_folder(root / "sequences" / name) as folder:
+    poses, sequence = root / "poses" / f"{name}.txt", root / "sequences" / name
+    with replacing(poses) as truth, new_folder(sequence) as folder:  # both appear when complete
+        write_poses(truth, velo_to_camera(invert(T[0]) @ T, _TR))
         (folder / "velodyne").mkdir()
         tasks = [(folder / "velodyne" / f"{i:06d}.bin", name, settings, i) for i in range(len(T))]
         alone = workers == 1 or len(tasks) <= 8
@@ -1618,7 +1621,6 @@ def _simulate_sequence(root, name, settings, workers):
             pass
         _write_calib_and_times(folder, _TR, 0.1 * np.arange(len(T)), _CAMERAS)
         (folder / "simulated.json").write_text(json.dumps(settings))
-        write_poses(root / "poses" / f"{name}.txt", velo_to_camera(invert(T[0]) @ T, _TR))
 
 
 def simulate(root: str | Path, seed=0, sequences="all", scans=None, azimuth=1800,
@@ -1636,12 +1638,13 @@ def simulate(root: str | Path, seed=0, sequences="all", scans=None, azimuth=1800
     elsewhere or with other settings, and OSError if a file cannot be written.
     """
     root, names = Path(root), expand_splits(sequences)
-    for name, value, least in (("seed", seed, 0), ("scans", scans, 1), ("azimuth", azimuth, 16),
-                               ("workers", workers, 1)):
-        if value is not None and (value != int(value) or value < least):
+    for name, value, least in (("seed", seed, 0), ("scans", 1 if scans is None else scans, 1),
+                               ("azimuth", azimuth, 16),
+                               ("workers", 1 if workers is None else workers, 1)):
+        if not isinstance(value, (int, np.integer)) or value < least:
             raise ValueError(f"{name} is {value} but must be a whole number, {least} or more.")
     for name in names:
-        if not isinstance(name, str) or name in ("", ".", "..") or re.search(r"[/\\\0]", name):
+        if not isinstance(name, str) or re.search(r"^\.|^$|[/\\\0]", name):
             raise ValueError(f"The sequence name {name!r} is no plain folder name: use one such "
                              "as '00'.")
     default = dict.fromkeys(SPLITS["test"] + SPLITS["validation"], 170)
@@ -1690,7 +1693,7 @@ def _command_line(argv):
 
 
 def main(argv=None):
-    """The command line -> exit code: 0, 2 for bad input, 130 when interrupted."""
+    """Run the command line. Returns the exit code of `run_command`."""
     args = _command_line(argv)
     treat_sigterm_as_interrupt()
 

@@ -1,4 +1,5 @@
-"""Errors of a trajectory: KITTI's segment errors, errors per step, ATE and RPE. NumPy only.
+"""Errors of a trajectory: KITTI's segment errors, errors per step, ATE and RPE. NumPy only, but
+for pictures.
 
 A trajectory is an array (n,4,4) of poses: T_0i maps points from frame i to frame 0, in metres. In
 KITTI's pose files, frame i is the rectified left camera at scan i. The segment errors are those of
@@ -55,10 +56,11 @@ def segment_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
     fields first and last (frames), length [m], t_err [%], r_err [deg/m]. `kitti_errors` computes
     the means in eqs. 7 and 8.
 
-    A segment starts at every 10th frame. It ends at the first frame whose true path from there is
-    longer than 100, 200, ... 800 m. Errors are divided by this nominal length, as in the devkit,
-    and not by the straight distance of eqs. 7 and 8. The devkit sums the path in float32, which can
-    shift `last` by one frame; here it is float64. Raises ValueError if the shapes differ.
+    A segment starts at every 10th frame, as in the devkit. It ends at the first frame at which the
+    true path since its start is longer than 100, 200, ... 800 m. Errors are divided by this nominal
+    length, as in the devkit, and not by the straight distance of eqs. 7 and 8. The devkit sums the
+    path in float32, which can shift `last` by one frame; here it is float64. Raises ValueError if
+    the shapes differ.
     """
     T_gt, T_est = _same_shape(T_gt, T_est)
     path = path_lengths(T_gt)  # (n,)
@@ -77,9 +79,9 @@ def segment_errors(T_gt: np.ndarray, T_est: np.ndarray) -> np.ndarray:
     delta_gt = np.linalg.inv(T_gt[first]) @ T_gt[last]  # (segments,4,4)
     delta_est = np.linalg.inv(T_est[first]) @ T_est[last]  # (segments,4,4)
     error = np.linalg.inv(delta_est) @ delta_gt  # (segments,4,4)
-    distance = np.linalg.norm(error[:, :3, 3], axis=1)  # [m]
-    trace = np.trace(error[:, :3, :3], axis1=1, axis2=2)
-    angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))  # eq. 6 [rad]
+    distance = np.linalg.norm(error[:, :3, 3], axis=1)  # (segments,) [m]
+    trace = np.trace(error[:, :3, :3], axis1=1, axis2=2)  # (segments,)
+    angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))  # (segments,) eq. 6 [rad]
 
     out = np.empty(len(first), SEGMENT)
     out["first"], out["last"], out["length"] = first, last, length
@@ -190,11 +192,12 @@ def table(rows):
 
 @contextmanager
 def naming(path):
-    """Name the file in an OSError of the block that has no name, such as for a full disk."""
+    """Add the path to a system error of the block that names no file, such as that of a full disk.
+    """
     try:
         yield
     except OSError as error:
-        if error.filename is None:
+        if error.errno and error.filename is None:  # our own errors have no errno
             raise OSError(f"{path}: could not be written ({error.strerror or error})") from None
         raise
 
@@ -371,7 +374,7 @@ def draw(path, trajectories):
 
 
 def run_command(name, work, advice="run it again"):
-    """Call work(). Returns the exit code: 0, 2 for bad input, 130 when interrupted.
+    """Call work(). Returns the exit code: 0, 2 for an error, 130 when interrupted.
 
     An error is printed in one line on stderr. advice: what to do after an interruption.
     """
@@ -380,7 +383,7 @@ def run_command(name, work, advice="run it again"):
             stream.reconfigure(errors="backslashreplace")
     try:
         work()
-        print(end="", flush=True)
+        print(end="", flush=True)  # a closed pipe raises here and not at exit
         return 0
     except KeyboardInterrupt as interrupt:
         print(f"\n{name}: interrupted; {str(interrupt) or advice}", file=sys.stderr)
@@ -438,7 +441,7 @@ def _compare(gt, est, picture=None):
 
 
 def main(argv=None):
-    """Run the command line. Returns the exit code: 0, or 2 for bad input."""
+    """Run the command line. Returns the exit code of `run_command`."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     path = dict(type=lambda text: Path(text).expanduser())
