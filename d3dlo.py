@@ -100,10 +100,14 @@ class Config:
     frozen: float = 0.0  # ours: train this last share of the steps with fixed BatchNorm statistics
 
     def __post_init__(self):
-        # JSON turns a Layer into a list. Turn it back; an immutable class needs object.__setattr__.
-        for name in ("sa1", "fe", "sa2", "sa3", "mpn", "mlp"):
-            *rest, widths = getattr(self, name)
-            object.__setattr__(self, name, Layer(*rest, tuple(widths)))
+        # A round trip through JSON turns NumPy's numbers into Python's, and Layers into lists. Turn
+        # the lists back. (An immutable class needs object.__setattr__.)
+        text = json.dumps(vars(self), default=lambda x: getattr(x, "item", x.__repr__)())
+        for name, value in json.loads(text).items():
+            if isinstance(getattr(Config, name), Layer):
+                *rest, widths = value
+                value = Layer(*rest, tuple(widths))
+            object.__setattr__(self, name, value)
         check_config(self)
 
     def as_dict(self):
@@ -678,7 +682,7 @@ def load_weights(path: str | Path | None = None, network=D3DLO):
     Raises FileNotFoundError if there is no such file, and ValueError if it is damaged or of another
     kind.
     """
-    path = Path(path or PRETRAINED)
+    path = Path(PRETRAINED if path is None else path)
     path = path / "weights.pt" if path.is_dir() else path
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; give a weights.pt or the folder of a "
@@ -749,27 +753,28 @@ class Odometry:
         require("refine", [refine], 0, 100)  # the time of a scan grows with it
         net, self.facts = load_weights(weights, network)
         self.net, self.device, self.refine = net.to(device), device, refine
-        self.warned = False  # about scans unlike those in training
         self.restart()
 
     def restart(self):
         """Forget all scans. The next one defines the frame of the poses."""
+        self.warned = set()  # the kinds of warnings that were given
         self.last = self.keyframe = None  # records and pose of the last scan and of a keyframe
 
     def register(self, scan: np.ndarray) -> np.ndarray:
         """Scan (N,4): x, y, z [m], intensity 0 to 1 -> its pose T_0t (4,4), Velodyne frame.
 
-        The first pose is the identity. Warns about invalid points and, once, about scans unlike
-        those in training. Raises ValueError if the scan cannot be used; the state is then
+        The first pose is the identity. Warns of invalid points and of scans unlike those in
+        training, once each until `restart`. Raises ValueError if the scan cannot be used; the state is then
         unchanged.
         """
         records = scan_records(scan, self.net.config, max(self.refine, 1))
-        if invalid := records["invalid"][0]:
-            warnings.warn(f"dropped {invalid} {INVALID_POINTS}", stacklevel=2)
+        invalid = records["invalid"][0]
         shift = kitti.domain_shift(records["stats"][0], self.facts["seen"])
-        if shift and not self.warned:
-            warnings.warn(f"{SHIFT_WARNING}: {shift}", stacklevel=2)
-            self.warned = True
+        for kind, found, text in (("points", invalid, f"dropped {invalid} {INVALID_POINTS}"),
+                                  ("shift", shift, f"{SHIFT_WARNING}: {shift}")):
+            if found and kind not in self.warned:
+                self.warned.add(kind)
+                warnings.warn(text, stacklevel=2)
         return self.register_records(records)
 
     def register_records(self, records):
@@ -1011,7 +1016,7 @@ def evaluate(data=None, weights=None, sequences=None, out=None, device="cpu", re
     root = data_root(data, sequences)
     chosen = kitti.open_sequences(root, sequences)
     loaded = load_records(chosen, odometry.net.config)
-    source = {"weights": str(weights or PRETRAINED), "data": str(root), "refine": refine}
+    source = {"weights": str(weights or PRETRAINED), "data": str(root), "refine": int(refine)}
     out = claim_output(out, "results", "results.json", source)
 
     errors, trained_on, trajectories = {}, {}, {}
@@ -1179,7 +1184,7 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device=None,
         device = device or run_device
     else:
         check_output(out, "runs", data or SIMULATED)
-    device = device or "cpu"
+    device = str(device or "cpu")
     check_device(device)
     require("seed", [seed], 0, 2**63 - 1)
     config = config or (Config() if data else Config(**SHORT))
@@ -1198,7 +1203,7 @@ def train(config=None, data=None, sequences=None, out=None, seed=0, device=None,
         net.config = replace(net.config, **settings)
 
     # The data. All scans are read, so that an unusable one is found now and not after the training
-    root = data_root(data, [*(sequences or ()), "all"])
+    root = data_root(data, [*kitti.expand_splits(sequences or ()), "all"])
     chosen, held_out = choose_sequences(root, sequences)
     motions, names = [s.motions() for s in chosen], [s.name for s in chosen]
     per_epoch = steps_per_epoch(sum(map(len, motions)), net.config)

@@ -137,13 +137,14 @@ def _check_size(path, size=None):
                          "np.save(NEW, np.fromfile(OLD, 'float32').reshape(-1, 5)[:, :4]).")
 
 
-def _is_scan(points):
-    """Whether the columns of points (N,4+) look like x, y, z [m] and intensity, 0 to 1 or to 255.
+def _is_scan(points, intensity_max=255):
+    """Whether the columns of points (N,4+) look like x, y, z [m] and an intensity up to a maximum.
 
     One point in a hundred may be anything.
     """
     with np.errstate(invalid="ignore"):  # NaN does not count against a scan
-        odd = (np.abs(points[:, :3]) > 1e5).any(1) | (points[:, 3] > 255) | (points[:, 3] < -0.01)
+        odd = ((np.abs(points[:, :3]) > 1e5).any(1)
+               | (points[:, 3] > intensity_max) | (points[:, 3] < -0.01))
     return np.count_nonzero(odd) <= len(points) / 100
 
 
@@ -154,8 +155,10 @@ def read_scan(path: str | Path, intensity_max: float = 1) -> np.ndarray:
     `intensity_max` and clipped to 0..1. NaN is kept. A .bin file holds four float32 per point, like
     KITTI's. A .npy file holds an array (N,3) or (N,4); without a fourth column the intensities are
     0. Raises OSError if the file cannot be read, and ValueError if it is empty, damaged or of
-    another format, with what it looks like.
+    another format, with what it looks like, or if `intensity_max` is not positive.
     """
+    if not 0 < intensity_max < np.inf:
+        raise ValueError(f"intensity_max is {intensity_max}, but must be a positive number")
     path = Path(path)
     if path.suffix == ".npy":
         points, data = _read_npy(path), b""
@@ -169,8 +172,8 @@ def read_scan(path: str | Path, intensity_max: float = 1) -> np.ndarray:
     scan = np.zeros((len(points), 4), np.float32)
     with np.errstate(over="ignore"):  # numbers too large for float32 become infinite
         scan[:, :points.shape[1]] = points
-    if not _is_scan(scan):
-        advice = "save these columns as float32"
+    if not _is_scan(scan, max(255, intensity_max)):
+        advice = "save these columns as float32, and intensities divided by their maximum"
         for kind, (dtype, columns) in OTHER_COLUMNS.items():
             numbers = np.frombuffer(data, dtype)
             if len(data) and len(numbers) % columns == 0 and _is_scan(numbers.reshape(-1, columns)):

@@ -67,8 +67,8 @@ SEED = st.integers(0, 2**32 - 1)
 generator, inverse = np.random.default_rng, np.linalg.inv
 
 # A network with every kind of layer and a hundredth of the work
-SMALL = Config(sa1=Layer(2.0, 16, 4, (4, 8, 16)), fe=Layer(None, None, 6, (16, 32)),
-               sa2=Layer(4.0, 8, 8, (32, 32)), sa3=Layer(8.0, 4, 4, (32, 32)),
+SMALL = Config(sa1=Layer(2.0, 16, 4, (4, 8, 16)), fe=Layer(None, None, 6, (16, 24)),
+               sa2=Layer(4.0, 8, 8, (32, 40)), sa3=Layer(8.0, 4, 4, (32, 36)),
                mpn=Layer(None, None, None, (32, 64)), mlp=Layer(None, None, None, (32, 6)),
                max_range=50.0)
 # The paper's training, and one with everything that has a state: nine steps on `two_sequences`
@@ -160,7 +160,7 @@ def train(folder, config, checkpoint=None, network=D3DLO, data=None, every=1e9, 
 def files_in(folder):
     """{name: content} of weights and checkpoints, tensors as lists."""
     return {path.name: tree_map(lambda x: x.tolist() if isinstance(x, torch.Tensor) else x,
-                                torch.load(path)) for path in folder.glob("*")}
+                                torch.load(path)) for path in folder.glob("*.pt")}
 
 
 EVAL = "eval --data root --weights w.pt --out out"
@@ -250,7 +250,7 @@ def original(tmp_path_factory):
         for i in range(1, 13):
             np.save(f"drive/scan {i}.npy", random_scan(generator(i), 50))
         kitti.simulate("city", sequences=["07"], scans=2, azimuth=100)
-        torch.manual_seed(0)
+        torch.manual_seed(2)
         net = d3dlo.D3DLO(SMALL)
         net.mlp[-1].weight.data *= 30  # so that the predictions depend visibly on the scans
         save_weights("w.pt", net, mean_motion=[10.0, 1, 0, 0, 0, 3],
@@ -531,6 +531,8 @@ def test_the_default_is_table_1_with_61290_parameters_and_section_4():
                  max_range=None, plane=True, epochs=500, optimizer="adam", schedule="steps",
                  augment=False, frozen=0)
     assert Config().as_dict() == dict(batch=16, lr=1e-3) | paper  # it does not give these two
+    assert {split: " ".join(names) for split, names in SPLITS.items()} == {
+        "train": "00 01 02 08 09", "test": "03 04 05 06 10", "validation": "07"}
     adam, = d3dlo.make_optimizers(net, torch.nn.L1Loss())
     assert type(adam) is torch.optim.Adam
     assert adam.defaults == torch.optim.Adam([torch.zeros(1)]).defaults  # "with default values"
@@ -592,7 +594,7 @@ def test_all_tensors_are_made_on_the_device_of_the_input(training):
     batch, net = d3dlo.make_batch(records, p, q, SMALL, "meta"), D3DLO(SMALL).to("meta")
     assert all(part.is_meta for part in batch) and batch.idx_fe.shape == (3, 16, 6)
     y_hat = net.train(training)(batch)  # PyTorch refuses to mix tensors of two devices
-    torch.nn.L1Loss()(y_hat, torch.empty_like(y_hat)).backward()
+    d3dlo.loss_of(net, torch.nn.L1Loss(), batch, random_motion(generator(0), n=3)).backward()
     assert y_hat.shape == (3, 6) and y_hat.is_meta and net.sa1.mpn.h[0].weight.grad.is_meta
 
 
@@ -660,11 +662,12 @@ def test_pairs_are_swapped_mirrored_aligned_and_moved_as_often_as_they_should():
 def test_the_network_can_overfit_sixteen_pairs(tmp_path):
     data = pairs_of_scans(generator(0), 16)
     config = replace(SMALL, epochs=200, lr=1e-2, schedule="one-cycle", frozen=0.25)
-    train(tmp_path, config, data=data)
+    *_, line = train(tmp_path, config, data=data)
     net, _ = load_weights(tmp_path)
     got = to_vector([d3dlo.predict_motions(net, records)[0] for records, _ in data])
     truth = to_vector([motions[0] for _, motions in data])
     assert np.abs(truth).mean() > 0.3 and np.abs(got - truth).mean() < 0.03
+    assert float(re.search(r"loss (\S+),", line)[1]) < 0.03
 
 
 def test_the_log_has_equation_2_and_rates_that_drop_at_epochs_300_and_400_of_500(tmp_path):
@@ -709,6 +712,11 @@ def test_an_interrupted_run_is_resumed_to_the_same_bits(tmp_path, config, step):
         said += train(part, config, checkpoint, objective=Loss(), test=test, every=0)
         same = files_in(part) == files_in(whole)
         assert same
+    # Both optimizers take every step at its own rate
+    assert all(part["last_epoch"] == 9 for part in checkpoint["parts"] if "last_epoch" in part)
+    torch.manual_seed(0)
+    first, last = D3DLO(config).state_dict(), checkpoint["parts"][0]
+    assert not any(torch.equal(first[name], last[name]) for name in first if "weight" in name)
     # The test loss is logged and has no other effect
     assert [re.sub(r", test loss \d\.\d{4}", "", line) for line in said] == lines
     net, _ = load_weights(part)
@@ -727,6 +735,16 @@ def test_an_interruption_leaves_the_previous_file(tmp_path, monkeypatch):
     with pytest.raises(OSError, match="weights.pt.*No space"):
         d3dlo.save(tmp_path / "weights.pt", step=2)
     assert files_in(tmp_path) == {"weights.pt": {"step": 1}}
+
+
+@pytest.mark.parametrize("seconds, weights, checkpoints", [(40, 2, 5), (110, 3, 9)])
+def test_checkpoints_are_stored_every_minute_and_weights_every_five(
+        tmp_path, monkeypatch, seconds, weights, checkpoints):
+    saved, clock = [], SimpleNamespace(monotonic=itertools.count(0, seconds).__next__)
+    monkeypatch.setattr(d3dlo, "time", clock)  # nine steps, each as long as given
+    monkeypatch.setattr(d3dlo, "save", lambda path, **content: saved.append(path.stem))
+    d3dlo.fit(D3DLO(PAPERS), two_sequences(), tmp_path, say=lambda line: None, **FACTS)
+    assert (saved.count("weights"), saved.count("checkpoint")) == (weights, checkpoints)
 
 
 @given(step=st.integers(1, 9), tested=st.booleans(), every=st.sampled_from([0, 60]),
@@ -761,6 +779,13 @@ def test_statistics_are_recomputed_for_each_weights_file_until_they_are_frozen(
         torch.testing.assert_close(half[name], net.state_dict()[name], rtol=1e-3, atol=1e-3)
         assert torch.equal(half[name], last[name]) and not torch.equal(half[name], lagging[name])
     assert not torch.equal(half["mlp.0.weight"], last["mlp.0.weight"])
+
+
+def test_weights_of_a_gpu_are_read_without_one(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(torch.serialization, "location_tag", lambda storage: "cuda:0")
+        path = save_weights(tmp_path / "w.pt", D3DLO(SMALL))
+    assert not any(x.is_cuda for x in load_weights(path)[0].parameters())
 
 
 def test_muon_trains_the_hidden_matrices_with_steps_as_large_as_adams():
@@ -868,6 +893,11 @@ def test_metrics_prints_the_errors_of_files_and_folders(cwd, capsys):
     for names in ("gt/03.txt est/03.txt", "gt est"):
         out = succeeds(f"metrics {names}", capsys)
         assert_allclose(figures(out, "03"), expected, atol=6e-4)
+    for length in (100, 200):
+        rows = [errors[errors[:, 2] == length, 3] for errors in (
+            devkit_errors(gt, est), devkit_errors(gt[:200], gt[:200]))]
+        expected = [len(np.concatenate(rows)), np.concatenate(rows).mean()]
+        assert_allclose(figures(out, f"{length} m")[:2], expected, atol=6e-4)
     pooled = np.r_[E_t, devkit_errors(gt[:200], gt[:200])[:, 3]]
     assert_allclose(figures(out, "all")[:2], [len(pooled), pooled.mean()], atol=6e-4)
 
@@ -899,6 +929,7 @@ def test_points_within_15_cm_of_the_ground_are_removed_and_nothing_else(seed, ro
     assert_array_equal(kitti.remove_plane(scan, seed=seed), scan[order >= 3040])
     points, invalid = kitti.usable_points(scan, plane=False)
     assert_array_equal(points, scan[(order >= 3040) & (order < 4580)])
+    assert scan_records(scan, replace(SMALL, plane=False))["stats"][0, 0] == len(points)
     assert invalid == 2
     for N, thick in ((500, 0), (5000, 0.1), (2, 0), (0, 0)):  # walls, and too few points
         wall = generator(0).uniform(-9, 9, (N, 3)) * [thick, 1, 1]
@@ -1175,7 +1206,7 @@ def test_degenerate_scenes_give_a_rigid_motion(tmp_path):
             assert_allclose(T @ kitti.invert(T), np.eye(4), atol=1e-9)  # fails for NaN, too
 
 
-def test_odometry_warns_once_about_domain_shift_and_each_time_about_invalid_points(tmp_path):
+def test_odometry_warns_once_about_domain_shift_and_once_about_invalid_points(tmp_path):
     seen = [[1e5, 0.1, 1, 0.01], [2e5, 1, 100, 1]]
     odometry = d3dlo.Odometry(save_weights(tmp_path / "w.pt", random_net(generator(0)), seen=seen))
     scan = random_scan(generator(0), 60)
@@ -1183,9 +1214,13 @@ def test_odometry_warns_once_about_domain_shift_and_each_time_about_invalid_poin
     with pytest.warns(UserWarning) as warned:
         for some_scan in (scan, invalid, scan, invalid):
             odometry.register(some_scan)
-    shift, *dropped = (str(warning.message) for warning in warned)
+        odometry.restart()
+        odometry.register(invalid)
+    shift, dropped, *again = (str(warning.message) for warning in warned)
     assert shift.endswith("wrong: usable points 60 (in training 1e+05 to 2e+05)")  # nothing else
-    assert len(dropped) == 2 and all("dropped 2 invalid points" in text for text in dropped)
+    assert "dropped 2 invalid points" in dropped and again == [dropped, shift]
+    assert "mean intensity 50 (" in kitti.domain_shift([1, 50, 1, 1], [[1.0] * 4] * 2)
+    assert kitti.domain_shift([1.4, 0.7, 1, 1], [[1.0] * 4] * 2) == ""
 
 
 def test_the_pretrained_weights_are_accurate_on_an_unseen_sequence(tmp_path):
@@ -1231,8 +1266,20 @@ def test_eval_writes_what_it_prints_and_agrees_with_the_metric(cwd, capsys):
             segments += [*errors[:, 3]] * (name == "network")
     assert list(results["lengths"]) == ["100 m"]  # for longer ones the drives are too short
     assert results["lengths"]["100 m"]["E_t"] == pooled["E_t"] == pytest.approx(np.mean(segments))
+    succeeds(f"{EVAL}2 --refine 1", capsys)
+    for name in ("00", "03"):  # every drive starts anew
+        assert_allclose(metrics.read_poses(f"out2/{name}.txt")[0], np.eye(4), atol=1e-9)
     again = figures(succeeds("metrics root/poses out", capsys), "03")
     assert again[:3] == figures(out, "03")[:3]  # the errors per step are in the camera's frame
+
+
+def test_eval_names_the_scans_that_are_unlike_the_training_data_or_have_invalid_points(cwd, capsys):
+    weights(seen=[[60, 0.1, 1, 0.01], [1e6, 1, 100, 1]])()
+    put(SCAN, lambda data: data[:16 * 30] + np.full(4, np.nan, "f4").tobytes())()
+    assert run(EVAL) == 0
+    err = capsys.readouterr().err
+    assert "sequence 00: 1 of 15 scans look unlike" in err and "usable points 30 (" in err
+    assert "sequence 00: dropped 1 invalid points" in err and "in 1 of 15 scans" in err
 
 
 @pytest.mark.parametrize("refine", [0, 2])
@@ -1302,22 +1349,41 @@ def test_every_option_of_train_has_an_effect(cwd):
 
     first, _, model = train("--weights w.pt")
     for option, words in {"epochs 3": "epoch 3/3", "batch 7": "of 2 batches", "lr 0.25": "2.5e-01",
-                          "sequences 03": "scans of 03", "short": "rate 4.0e-0"}.items():
+                          "sequences 03": "scans of 03", "short": "rate 4.0e-08"}.items():
         assert words in train(f"--weights w.pt --{option}")[0] and words not in first
+    assert "test loss" in first and "test loss" not in train("--sequences 03 --weights w.pt")[0]
     for seed in (0, 1):
         other = train(f"--weights w.pt --seed {seed}")[2]
         assert torch.equal(model["mlp.0.weight"], other["mlp.0.weight"]) == (seed == 0)
     shutil.rmtree("root/sequences/03")
     for i in range(15):  # enough points for the network of Table 1
         random_scan(generator(i), 1200).tofile(f"{SCANS}/{i:06d}.bin")
-    (_, config, model), (*_, other) = (
-        train(f"--neighbors 5 --no-plane --lr 1e-9 --seed {seed}") for seed in (0, 1))
+    (_, config, model), (*_, other), (*_, again) = (
+        train(f"--neighbors 5 --no-plane --lr 1e-9 --seed {seed}") for seed in (0, 1, 0))
     sa1 = Layer(1.0, 1024, 5, (4, 8, 16, 32))
     assert config == Config(epochs=1, lr=1e-9, plane=False, sa1=sa1).as_dict()
     assert (model["mlp.0.weight"] - other["mlp.0.weight"]).abs().max() > 1e-3  # initial weights
+    assert torch.equal(model["mlp.0.weight"], again["mlp.0.weight"])
 
 
-LONG = "train --data root --weights w.pt --short --epochs 4 --batch 4 --out"
+def test_train_uses_the_config_and_the_objective_that_it_is_given(cwd):
+    config = replace(PAPERS, epochs=np.int64(3), lr=np.float32(0.001))
+    d3dlo.train(config, "root", "00", "new", device=torch.device("cpu"), objective=Loss())
+    assert (read("new/checkpoint.pt")["parts"][1]["weights"] != 0).all()  # learned, by Adam
+    assert read("new/weights.pt")["config"] == pytest.approx(PAPERS.as_dict())
+    with pytest.raises(ValueError, match="within 1000 m.* needs 1024"):
+        d3dlo.train(data="root")  # the paper's settings
+
+
+def test_a_run_without_a_checkpoint_yet_is_resumed_from_the_weights_it_started_with(cwd):
+    assert run(f"{TRAIN} --lr 1e-9") == 0
+    shutil.copytree("new", "part")
+    delete("part/checkpoint.pt", "part/weights.pt")()
+    assert run("train --out part --resume") == 0
+    assert files_in(Path("part")) == files_in(Path("new"))
+
+
+LONG = "train --data root --weights w.pt --short --epochs 4 --batch 4 --seed 3 --out"
 
 
 def train_until(action):
@@ -1589,6 +1655,13 @@ def test_intensities_of_0_to_255_are_scaled_and_said_and_outliers_are_clipped(cw
                     "train --data root --sequences 00 --weights w.pt --epochs 1"):
         assert run(command) == 0
         assert "sequence 00: intensities reach 255; all are divided" in capsys.readouterr().err
+    records, = load_records([s], SMALL)
+    assert_allclose(records["stats"][:, 1], good[:, 3].mean(), rtol=1e-4)
+    np.save("16bit.npy", good * np.float32([1, 1, 1, 4095]))
+    assert_allclose(kitti.read_scan("16bit.npy", 4095), good, rtol=1e-6)
+    for maximum in (0, -1, np.nan, np.inf):
+        with pytest.raises(ValueError, match="intensity_max is"):
+            kitti.read_scan("16bit.npy", maximum)
 
 
 def test_points_without_a_return_are_dropped_and_copies_do_not_count(tmp_path):
