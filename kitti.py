@@ -771,11 +771,11 @@ def convert_raw(drive: str | Path, root: str | Path) -> dict[str, tuple[int, int
                 raise ValueError(f"{path} already exists: remove it or choose another ROOT.")
     with ExitStack() as stack:
         for part, run in parts.items():
+            folder = stack.enter_context(new_folder(root / "sequences" / part))
             truth = stack.enter_context(replacing(root / "poses" / f"{part}.txt"))
+            _write_raw_sequence(folder, [scans[i] for i in run], Tr, times[run])
             T = invert(T_imu[run[0]]) @ T_imu[run]  # relative to the first pose, IMU frame
             write_poses(truth, velo_to_camera(T, Tr @ T_velo_imu))
-            folder = stack.enter_context(new_folder(root / "sequences" / part))
-            _write_raw_sequence(folder, [scans[i] for i in run], Tr, times[run])
     return {part: (int(numbers[run[0]]), int(numbers[run[-1]])) for part, run in parts.items()}
 
 
@@ -1613,9 +1613,8 @@ def _is_complete(root, name, settings):
 def _simulate_sequence(root, name, settings, workers):
     """Write ROOT/sequences/NAME and ROOT/poses/NAME.txt."""
     T = _world(name, settings["seed"], settings["scans"]).T
-    poses, sequence = root / "poses" / f"{name}.txt", root / "sequences" / name
-    with replacing(poses) as truth, new_folder(sequence) as folder:  # both appear when complete
-        write_poses(truth, velo_to_camera(invert(T[0]) @ T, _TR))
+    sequence, poses = root / "sequences" / name, root / "poses" / f"{name}.txt"
+    with new_folder(sequence) as folder, replacing(poses) as truth:  # both appear when complete
         (folder / "velodyne").mkdir()
         tasks = [(folder / "velodyne" / f"{i:06d}.bin", name, settings, i) for i in range(len(T))]
         alone = workers == 1 or len(tasks) <= 8
@@ -1624,6 +1623,7 @@ def _simulate_sequence(root, name, settings, workers):
             pass
         _write_calib_and_times(folder, _TR, 0.1 * np.arange(len(T)), _CAMERAS)
         (folder / "simulated.json").write_text(json.dumps(settings))
+        write_poses(truth, velo_to_camera(invert(T[0]) @ T, _TR))
 
 
 def simulate(root: str | Path, seed=0, sequences="all", scans=None, azimuth=1800,
