@@ -764,8 +764,8 @@ class Odometry:
         """Scan (N,4): x, y, z [m], intensity 0 to 1 -> its pose T_0t (4,4), Velodyne frame.
 
         The first pose is the identity. Warns of invalid points and of scans unlike those in
-        training, once each until `restart`. Raises ValueError if the scan cannot be used; the state is then
-        unchanged.
+        training, once each until `restart`. Raises ValueError if the scan cannot be used; the state
+        is then unchanged.
         """
         records = scan_records(scan, self.net.config, max(self.refine, 1))
         invalid = records["invalid"][0]
