@@ -166,8 +166,8 @@ def farthest_point_sampling(xyz: np.ndarray, n: int) -> np.ndarray:
     result for n = m. Raises ValueError unless 0 < n <= N.
 
     The trick: let r be the distance of the new centroid from its nearest earlier one. No point is
-    farther than r from its own nearest one, so only for points closer than r to the new centroid
-    does the nearest one change. Sorted by x, they lie in a slice.
+    farther than r from its nearest centroid, so the new one can be nearer only to points within r
+    of itself. Sorted by x, they lie in a slice.
     """
     if not 0 < n <= len(xyz):
         raise ValueError(f"cannot sample {n} of {len(xyz)} points")
